@@ -1,0 +1,200 @@
+"""Rasterizer for the CPU: numba, forward by bands of rows, backward by runs of Gaussians.
+
+Each output value is written by one thread in the order of the Gaussians, so results are equal
+to the bit whatever the number of threads. Along a row a Gaussian is a 1D Gaussian, and those
+follow a two-multiplication recurrence: g(x+1) = g(x) r(x), r(x+1) = r(x) exp(-1/s^2).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import numba
+import numpy as np
+import torch
+
+from ..gaussians import Gaussians
+from ..view import View
+from . import footprint
+
+_jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
+
+
+def render(gaussians: Gaussians, view: View, quality: str = "export") -> torch.Tensor:
+    """(h, w, 3) float32 image on the CPU, not clamped; differentiable in all five tensors.
+
+    quality: "screen", "export" or "gradient" (see footprint.cut).
+    """
+    g = gaussians.map(lambda tensor: tensor.to("cpu", torch.float32))
+    return _Rasterize.apply(g.mean, g.std, g.rho, g.peak, footprint.cut(g, quality), view)
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, mean, std, rho, peak, cut, view):
+        ctx.save_for_backward(mean, std, rho, peak, cut)
+        ctx.view = view
+        arrays = [np.ascontiguousarray(t.detach().numpy()) for t in (mean, std, rho, peak, cut)]
+        image = np.zeros((*view.size, 3), np.float32)
+        tasks = 1 if image.size * 8 < 1 << 18 else 4 * _threads()
+        bounds = np.linspace(0, view.size[0], tasks + 1).astype(np.int64)
+        geometry = (*view.origin, *view.scale)
+        _run(_forward, [(*arrays, *geometry, image, a, b) for a, b in _pairs(bounds)])
+        return torch.from_numpy(image)
+
+    @staticmethod
+    def backward(ctx, image_grad):
+        arrays = [np.ascontiguousarray(t.detach().numpy()) for t in ctx.saved_tensors]
+        upstream = np.ascontiguousarray(image_grad.numpy(), np.float32)
+        n = arrays[0].shape[0]
+        grads = np.zeros((n, 8), np.float32)  # mean 2, std 2, rho, peak 3
+        bounds = np.linspace(0, n, (1 if n < 4096 else 4 * _threads()) + 1).astype(np.int64)
+        geometry = (*ctx.view.origin, *ctx.view.scale)
+        _run(_backward, [(*arrays, *geometry, upstream, grads, a, b) for a, b in _pairs(bounds)])
+        columns = torch.from_numpy(grads)
+        return columns[:, 0:2], columns[:, 2:4], columns[:, 4], columns[:, 5:8], None, None
+
+
+@_jit
+def _span(center, half, limit):
+    """First and one past the last pixel index with |index - center| <= half, in [0, limit)."""
+    first = max(0.0, math.ceil(center - half))
+    last = min(limit - 1.0, math.floor(center + half))
+    if first > last:
+        return 0, 0
+    return int(first), int(last) + 1
+
+
+@_jit
+def _forward(mean, std, rho, peak, cut, ox, oy, sx, sy, image, row_start, row_stop):
+    """Add the Gaussians to image rows [row_start, row_stop)."""
+    width = image.shape[1]
+    for n in range(mean.shape[0]):
+        if not cut[n] >= 0.0:
+            continue
+        std_y = std[n, 1] * float(sy)  # output pixels
+        center_y = (mean[n, 1] - oy) * sy - 0.5
+        y0, y1 = _span(center_y, std_y * math.sqrt(cut[n]), row_stop)
+        y0 = max(y0, row_start)
+        if y0 >= y1:
+            continue
+        std_x = std[n, 0] * float(sx)
+        center_x = (mean[n, 0] - ox) * sx - 0.5
+        correlation = float(rho[n])
+        narrow = std_x * math.sqrt(1.0 - correlation * correlation)  # std along a row
+        falloff = math.exp(-1.0 / (narrow * narrow))
+        red, green, blue = peak[n, 0], peak[n, 1], peak[n, 2]
+        for y in range(y0, y1):
+            t = (y - center_y) / std_y
+            remaining = cut[n] - t * t
+            if remaining < 0.0:
+                continue
+            row_center = center_x + correlation * std_x * t
+            x0, x1 = _span(row_center, narrow * math.sqrt(remaining), width)
+            if x0 >= x1:
+                continue
+            e = (x0 - row_center) / narrow
+            weight = math.exp(-0.5 * (t * t + e * e))
+            ratio = 1.0
+            if x1 - x0 > 1:
+                ratio = math.exp(-(e + 0.5 / narrow) / narrow)
+            for x in range(x0, x1):
+                w = np.float32(weight)
+                image[y, x, 0] += w * red
+                image[y, x, 1] += w * green
+                image[y, x, 2] += w * blue
+                weight *= ratio
+                ratio *= falloff
+
+
+@_jit
+def _backward(mean, std, rho, peak, cut, ox, oy, sx, sy, upstream, grads, start, stop):
+    """Gradients of Gaussians [start, stop): sum over their pixels, then the chain rule.
+
+    With t = dy/std_y and e = (dx/std_x - rho t) / sqrt(1 - rho^2), q = t^2 + e^2; every
+    derivative of q is linear in e, t, e^2, e t, t^2, so five weighted sums hold all there is.
+    """
+    height, width = upstream.shape[:2]
+    for n in range(start, stop):
+        if not cut[n] >= 0.0:
+            continue
+        std_y = std[n, 1] * float(sy)
+        center_y = (mean[n, 1] - oy) * sy - 0.5
+        y0, y1 = _span(center_y, std_y * math.sqrt(cut[n]), height)
+        if y0 >= y1:
+            continue
+        std_x = std[n, 0] * float(sx)
+        center_x = (mean[n, 0] - ox) * sx - 0.5
+        correlation = float(rho[n])
+        root = math.sqrt(1.0 - correlation * correlation)
+        narrow = std_x * root
+        falloff = math.exp(-1.0 / (narrow * narrow))
+        red, green, blue = float(peak[n, 0]), float(peak[n, 1]), float(peak[n, 2])
+        sum_red = sum_green = sum_blue = 0.0
+        sum_e = sum_t = sum_ee = sum_et = sum_tt = 0.0
+        for y in range(y0, y1):
+            t = (y - center_y) / std_y
+            remaining = cut[n] - t * t
+            if remaining < 0.0:
+                continue
+            row_center = center_x + correlation * std_x * t
+            x0, x1 = _span(row_center, narrow * math.sqrt(remaining), width)
+            if x0 >= x1:
+                continue
+            e = (x0 - row_center) / narrow
+            weight = math.exp(-0.5 * (t * t + e * e))
+            ratio = 1.0
+            if x1 - x0 > 1:
+                ratio = math.exp(-(e + 0.5 / narrow) / narrow)
+            row_sum = row_e = row_ee = 0.0
+            for x in range(x0, x1):
+                e = (x - row_center) / narrow
+                r, g, b = upstream[y, x, 0], upstream[y, x, 1], upstream[y, x, 2]
+                sum_red += weight * r
+                sum_green += weight * g
+                sum_blue += weight * b
+                h = weight * (red * r + green * g + blue * b)
+                row_sum += h
+                row_e += h * e
+                row_ee += h * e * e
+                weight *= ratio
+                ratio *= falloff
+            sum_e += row_e
+            sum_ee += row_ee
+            sum_t += row_sum * t
+            sum_tt += row_sum * t * t
+            sum_et += row_e * t
+        tilt = correlation / root
+        grads[n, 0] = sx * sum_e / narrow
+        grads[n, 1] = sy * (sum_t - tilt * sum_e) / std_y
+        grads[n, 2] = sx * (sum_ee + tilt * sum_et) / std_x
+        grads[n, 3] = sy * (sum_tt - tilt * sum_et) / std_y
+        grads[n, 4] = (sum_et - tilt * sum_ee) / root
+        grads[n, 5] = sum_red
+        grads[n, 6] = sum_green
+        grads[n, 7] = sum_blue
+
+
+_pool: ThreadPoolExecutor | None = None
+
+
+def _threads() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _pairs(bounds: np.ndarray) -> list[tuple[int, int]]:
+    return [(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True) if a < b]
+
+
+def _run(kernel, calls: list[tuple]) -> None:
+    """Call the kernel once per argument tuple, in parallel; it releases the GIL."""
+    global _pool
+    if len(calls) == 1:
+        kernel(*calls[0])
+        return
+    if _pool is None:
+        _pool = ThreadPoolExecutor(_threads(), thread_name_prefix="rasterize")
+    for future in [_pool.submit(kernel, *call) for call in calls]:
+        future.result()

@@ -1,0 +1,71 @@
+"""GSASR: an encoder and a Gaussian decoder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import nn
+
+from ..errors import RequestError
+from ..gaussians import Gaussians
+from .decoder import DecoderConfig, GaussianDecoder
+from .encoders import EDSR, EDSRConfig
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """What a network is made of. The defaults are the paper's EDSR-baseline model."""
+
+    encoder: EDSRConfig = field(default_factory=EDSRConfig)
+    decoder: DecoderConfig = field(default_factory=DecoderConfig)
+
+
+class GSASR(nn.Module):
+    """A picture and a target scale -> raw Gaussians.
+
+    name: shown to the user and stored in fields; `multiple`: what picture sides must divide by.
+    """
+
+    def __init__(self, config: ModelConfig, name: str = "") -> None:
+        super().__init__()
+        self.config = config
+        self.name = name
+        self.encoder = EDSR(config.encoder)
+        self.decoder = GaussianDecoder(config.decoder, self.encoder.channels)
+
+    @property
+    def multiple(self) -> int:
+        return self.config.decoder.window
+
+    def encode(self, lr: torch.Tensor) -> torch.Tensor:
+        """(B, 3, h, w) in [0, 1], sides multiples of `multiple` -> (B, channels, h, w)."""
+        return self.encoder(lr)
+
+    def decode(self, features: torch.Tensor, scale: float | torch.Tensor) -> torch.Tensor:
+        """(B, channels, h, w) and a scale > 0, one number or (B,) -> (B, N, 9) raw columns."""
+        scale = torch.as_tensor(scale, dtype=torch.float32, device=features.device)
+        if not bool((scale > 0).all()):
+            raise RequestError("The conditioning scale must be above 0.")
+        return self.decoder(features, scale.expand(features.shape[0]))
+
+    def forward(self, lr: torch.Tensor, scale: float | torch.Tensor) -> torch.Tensor:
+        return self.decode(self.encode(lr), scale)
+
+
+def activate(raw: torch.Tensor, size: tuple[int, int]) -> Gaussians:
+    """(N, 9) raw columns of a picture of `size` (height, width) -> Gaussians.
+
+    The released kernel's activations. Its columns are crossed: column 0 spreads along y, column 1
+    along x. A spread of 1.2 kernel units is one source pixel, so std < 0.834 px.
+    """
+    height, width = size
+    spread = 0.99999 * torch.sigmoid(raw[:, 0:2]) + 1e-6
+    return Gaussians(
+        mean=raw[:, 7:9] * raw.new_tensor([width, height]),
+        std=spread.flip(1) / 1.2,
+        rho=0.999999 * torch.tanh(raw[:, 2]),
+        color=torch.sigmoid(raw[:, 4:7]),
+        opacity=torch.sigmoid(raw[:, 3]),
+        size=size,
+    )

@@ -49,3 +49,14 @@ def _densest(gaussians: Gaussians) -> float:
     row = gaussians.mean[:, 1].floor().clamp(0, height - 1).long()
     area = 2 * math.pi * gaussians.std.prod(dim=1) * (1 - gaussians.rho**2).clamp(min=0).sqrt()
     return float(torch.bincount(row * width + column, weights=area.double()).max())
+
+
+def bounds(gaussians: Gaussians, quality: str) -> tuple[float, float, float, float]:
+    """(x0, y0, x1, y1) in source pixels around every footprint; empty (0, 0, 0, 0) if none."""
+    limit = cut(gaussians, quality)
+    drawn = limit >= 0
+    if not bool(drawn.any()):
+        return 0.0, 0.0, 0.0, 0.0
+    mean, reach = gaussians.mean[drawn], gaussians.std[drawn] * limit[drawn].sqrt()[:, None]
+    low, high = (mean - reach).amin(dim=0), (mean + reach).amax(dim=0)
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])

@@ -1,0 +1,31 @@
+"""Refusing work that cannot fit in memory, before it starts."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from .errors import RequestError
+
+
+def available() -> int:
+    """Bytes that can be had without swapping; all physical memory where the system won't say."""
+    try:
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) * 1024
+    except OSError:
+        pass
+    if hasattr(os, "sysconf"):
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return 1 << 62
+
+
+def require_picture(size: tuple[int, int]) -> None:
+    """RequestError unless a picture of `size` (height, width) can be rendered and written."""
+    needed = size[0] * size[1] * 40  # float32 RGB, the clipped copy, and the bytes to write
+    if needed > available():
+        raise RequestError(
+            f"A {size[1]}x{size[0]} picture needs {needed / 2**30:.1f} GiB, "
+            f"but {available() / 2**30:.1f} GiB are free; use a smaller scale or a region."
+        )

@@ -1,0 +1,92 @@
+"""Gaussians to a finished picture, of a size chosen as people choose it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from . import rasterize
+from .errors import RequestError
+from .gaussians import Gaussians
+from .memory import require_picture
+from .model import GSASR
+from .predict import predict_tiles
+from .rasterize import footprint
+from .view import View
+
+TRAINED_SCALES = (1.0, 4.0)  # target scales that the networks saw in training
+
+
+def render(
+    field: Gaussians,
+    scale: float | None = None,
+    size: tuple[int, int] | None = None,
+    view: View | None = None,
+    backend: str = "auto",
+) -> np.ndarray:
+    """(h, w, 3) float32 picture of a field, sRGB, not clamped, within 1e-4 of the exact sum.
+
+    Exactly one of: scale (floor(scale * side) pixels), size (height, width) of the whole
+    picture, or view. backend: see rasterize.render. Raises RequestError, BackendError.
+    """
+    if sum(choice is not None for choice in (scale, size, view)) != 1:
+        raise RequestError("Give exactly one of scale, size and view.")
+    if scale is not None:
+        view = View.at_scale(field.size, scale)
+    elif size is not None:
+        view = View.to_size(field.size, size)
+    require_picture(view.size)
+    return rasterize.render(field, view, backend, "export").detach().numpy()
+
+
+def upscale(
+    model: GSASR,
+    image: np.ndarray,
+    view: View,
+    condition: float | None = None,
+    backend: str = "auto",
+    progress: Callable[[float], None] = lambda share: None,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> np.ndarray:
+    """(h, w, 3) float32 picture through `view`, without ever holding all Gaussians.
+
+    Each tile is predicted, drawn and dropped; since a picture is a sum of Gaussians, it is also
+    the sum of its tiles. image: (H, W, 3) float32 in [0, 1]. condition: the scale told to the
+    network; by default the view's, within what networks are trained for. progress: told the
+    share done in (0, 1].
+    """
+    require_picture(view.size)
+    if condition is None:
+        condition = conditioning_scale(max(view.scale))
+    picture = np.zeros((*view.size, 3), np.float32)
+    for part, share in predict_tiles(model, image, condition, cancelled=cancelled):
+        rows, columns, window = _window(part, view)
+        if window is not None:
+            drawn = rasterize.render(part, window, backend, "export")
+            picture[rows, columns] += drawn.numpy()
+        progress(share)
+    return picture
+
+
+def conditioning_scale(scale: float) -> float:
+    """The nearest scale that networks are trained for."""
+    return float(np.clip(scale, *TRAINED_SCALES))
+
+
+def _window(part: Gaussians, view: View) -> tuple[slice, slice, View | None]:
+    """The output pixels that `part` reaches, as slices and as a view of their own, or None."""
+    x0, y0, x1, y1 = footprint.bounds(part, "export")
+    left, top = view.to_output(x0, y0)
+    right, bottom = view.to_output(x1, y1)
+    columns = _clipped(left, right, view.size[1])
+    rows = _clipped(top, bottom, view.size[0])
+    if columns.start >= columns.stop or rows.start >= rows.stop:
+        return rows, columns, None
+    origin = view.to_source(columns.start, rows.start)
+    size = (rows.stop - rows.start, columns.stop - columns.start)
+    return rows, columns, View(origin, view.scale, size)
+
+
+def _clipped(low: float, high: float, length: int) -> slice:
+    return slice(int(np.clip(np.floor(low), 0, length)), int(np.clip(np.ceil(high), 0, length)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from .errors import GsasrError
@@ -30,7 +30,8 @@ def writing(path: str | os.PathLike, error: type[GsasrError]) -> Iterator[Path]:
         reason = failure.strerror or str(failure)
         raise error(f"Cannot write {path}: {reason}; choose another folder.") from failure
     finally:
-        beside.unlink(missing_ok=True)
+        with suppress(OSError):  # such as a folder that is none; the reason is already told
+            beside.unlink()
 
 
 def shipped(name: str) -> Path:

@@ -7,7 +7,7 @@
 .PHONY: demo test lint setup clean
 
 demo: setup
-	@scripts/demo.sh $(PICTURE)
+	@scripts/demo.sh "$(PICTURE)"
 
 test: setup
 	@.venv/bin/python -m pytest -q

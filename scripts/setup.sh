@@ -89,7 +89,7 @@ done_already && exit 0
 mkdir -p .cache
 if command -v flock >/dev/null; then # a second set-up at the same time waits, then finds it done
     exec 9>.cache/setup.lock
-    flock 9
+    flock -n 9 || { say "waiting for another set-up to finish"; flock 9; }
     done_already && exit 0
 fi
 : >$LOG

@@ -75,7 +75,6 @@ class GaussianDecoder(nn.Module):
         )
         for name, columns in HEADS.items():
             self.add_module(f"mlp_block_{name}", head(dim, c.head_expansion * dim, columns))
-        self._start_near_grey()
 
     def forward(self, features: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
         """(B, in_channels, h, w) features, (B,) scale -> (B, N, 9) raw Gaussians.
@@ -112,12 +111,16 @@ class GaussianDecoder(nn.Module):
         mean = offset / extent + cells / extent
         return torch.cat([*activations, mean], dim=-1).flatten(1, 2)
 
-    def _start_near_grey(self) -> None:
-        """Bias the opacity so that an untrained field sums to about mid-grey, not to m / 4."""
+    def initialise(self) -> None:
+        """Start with small, grey, overlapping Gaussians whose opacities sum to mid-grey."""
         # std starts at sigmoid(0) / 1.2 = 0.417 px; each Gaussian covers 2 pi std^2 = 1.09 px^2
         # with colour 0.5, so the opacities of one pixel must add up to about 0.9.
         share = min(0.5, 0.9 / self.config.gaussians_per_pixel)
-        nn.init.constant_(self.get_submodule("mlp_block_alpha")[4].bias, math.log(share / (1 - share)))
+        with torch.no_grad():
+            for name in HEADS:
+                last = self.get_submodule(f"mlp_block_{name}")[4]
+                last.weight.mul_(0.3 if name == "rgb" else 0.1)
+            self.get_submodule("mlp_block_alpha")[4].bias.fill_(math.log(share / (1 - share)))
 
     @staticmethod
     def config_from(state: dict[str, torch.Tensor]) -> DecoderConfig:
@@ -181,6 +184,8 @@ class CrossLayer(nn.Module):
         self.norm4 = nn.LayerNorm(dim)
         self.gs_cross_attn_scale = ScaleAttention(dim)
         self.window_cross_attn = WindowAttention(dim, config.heads, config.seeds, config.window)
+        if not shifted:
+            self.window_cross_attn.look_at_own_position()
         self.mlp_crossattn_scale = MLP(dim)
         self.mlp_crossattn_feature = MLP(dim)
 

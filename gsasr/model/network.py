@@ -33,6 +33,20 @@ class GSASR(nn.Module):
         self.name = name
         self.encoder = EDSR(config.encoder)
         self.decoder = GaussianDecoder(config.decoder, self.encoder.channels)
+        self.initialise()
+
+    def initialise(self) -> None:
+        """Draw weights that keep the size of the signal from layer to layer.
+
+        PyTorch's default shrinks it by 1.7 per layer, which hides the picture from the decoder for
+        the first hundreds of steps.
+        """
+        for layer in self.modules():
+            if isinstance(layer, (nn.Linear, nn.Conv2d)):
+                nn.init.normal_(layer.weight, std=layer.weight[0].numel() ** -0.5)
+                nn.init.zeros_(layer.bias)
+        self.encoder.initialise()
+        self.decoder.initialise()
 
     @property
     def multiple(self) -> int:

@@ -30,6 +30,15 @@ class EDSR(nn.Module):
     def channels(self) -> int:
         return self.config.channels
 
+    def initialise(self) -> None:
+        """Small residuals, so that deep stacks start stable; features of mid-grey start at 0."""
+        with torch.no_grad():
+            for block in self.body:
+                block.conv1.weight.mul_(0.1)
+                block.conv2.weight.mul_(0.1)
+            self.conv_first.weight.mul_(2)
+            self.conv_first.bias.copy_(-0.5 * self.conv_first.weight.sum((1, 2, 3)))
+
     def forward(self, picture: torch.Tensor) -> torch.Tensor:
         # No global skip: the released encoder computes and drops it.
         return self.conv_after_body(self.body(self.conv_first(picture)))
@@ -46,10 +55,6 @@ class ResidualBlock(nn.Module):
         super().__init__()
         self.conv1 = nn.Conv2d(channels, channels, 3, padding=1)
         self.conv2 = nn.Conv2d(channels, channels, 3, padding=1)
-        for conv in (self.conv1, self.conv2):  # small residuals let deep stacks start stable
-            nn.init.kaiming_normal_(conv.weight)
-            conv.weight.data.mul_(0.1)
-            nn.init.zeros_(conv.bias)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x + self.conv2(torch.relu(self.conv1(x)))

@@ -16,7 +16,7 @@ import numpy as np
 from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
 
 from .errors import ImageError
-from .files import writing
+from .files import check_writable, writing
 
 MAX_PIXELS = 256 * 1024**2  # a float32 picture of this size takes 3 GiB
 # Only decoders that work on the bytes alone: EPS, for one, would start Ghostscript.
@@ -129,14 +129,8 @@ def write(
 
 def check_output(path: str | os.PathLike) -> None:
     """Raise the ImageError now that `write` would raise after minutes of work: suffix, folder."""
-    path = Path(path)
-    _format(path)
-    if path.is_dir():
-        raise ImageError(f"{path} is a folder; give a file name in it.")
-    if not path.parent.is_dir():
-        raise ImageError(f"The folder {path.parent} does not exist; create it first.")
-    if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise ImageError(f"The folder {path.parent} is not writable; choose another.")
+    _format(Path(path))
+    check_writable(path, ImageError)
 
 
 # Reading
@@ -172,7 +166,7 @@ def _open(path: Path, file) -> Image.Image:
 def _decode(path: Path, image: Image.Image) -> Picture:
     try:
         icc = image.info.get("icc_profile") or None
-        pixels = _pixels16(path) if _is_16_bit(image) else _pixels8(path, image, icc)
+        pixels = _pixels16(path, image) if _is_16_bit(image) else _pixels8(path, image, icc)
         pixels = _upright(pixels, image.getexif().get(ExifTags.Base.Orientation, 1))
     except ImageError:
         raise
@@ -247,7 +241,7 @@ def _cmyk_to_srgb(image: Image.Image, icc: bytes) -> Image.Image:
         return image  # a broken profile; the plain formula does as well as it can
 
 
-def _pixels16(path: Path) -> np.ndarray:
+def _pixels16(path: Path, image: Image.Image) -> np.ndarray:
     """(H, W, C) uint16, C = 1 gray, 2 gray + alpha, 3 RGB, 4 RGBA."""
     import OpenImageIO as oiio
 
@@ -257,6 +251,10 @@ def _pixels16(path: Path) -> np.ndarray:
     pixels = file and file.read_image(0, 0, 0, file.spec().nchannels, oiio.UINT16)
     if pixels is None:
         raise OSError(file.geterror() if file else oiio.geterror())
+    if image.format == "TIFF" and image.tag_v2.get(262) == 0:  # "white is zero"
+        pixels = 65535 - pixels
+    if file.spec().alpha_channel < 0 and pixels.shape[2] in (2, 4):
+        pixels = pixels[..., :-1]  # an extra channel of no declared meaning
     return pixels[..., :4]
 
 

@@ -158,6 +158,26 @@ def test_16_bit_gray_tiff(tmp_path):
     assert np.array_equal(integers(picture)[..., 0], pixels)
 
 
+def test_16_bit_tiff_where_white_is_zero(tmp_path):
+    path = save(tmp_path / "a.tif", np.array([[0, 1000, 65535]], np.uint16))
+    tag = struct.pack("<HHI", 262, 3, 1)  # PhotometricInterpretation
+    assert tag + b"\1" in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(tag + b"\1", tag + b"\0"))
+    assert integers(read(path))[0, :, 0].tolist() == [65535, 64535, 0]
+
+
+def test_16_bit_tiff_with_an_extra_channel_that_is_no_alpha(tmp_path):
+    pixels = noise(5, 7, 4, bits=16)
+    path = tmp_path / "a.tif"
+    write(path, pixels[..., :3] / 65535, alpha=pixels[..., 3] / 65535, bits=16)
+    tag = struct.pack("<HHI", 338, 3, 1)  # ExtraSamples
+    assert tag + b"\2" in path.read_bytes()
+    path.write_bytes(path.read_bytes().replace(tag + b"\2", tag + b"\0"))
+    picture = read(path)
+    assert picture.alpha is None
+    assert np.array_equal(integers(picture), pixels[..., :3])
+
+
 def test_16_bit_pgm(tmp_path):
     pixels = noise(5, 7, bits=16)
     (tmp_path / "a.pgm").write_bytes(b"P5 7 5 65535\n" + pixels.astype(">u2").tobytes())
@@ -316,6 +336,7 @@ def test_truncated(tmp_path, name, part):
     suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60, deadline=None
 )
 @given(st.sampled_from(["PNG", "JPEG", "WEBP", "TIFF", "GIF", "BMP"]), st.data())
+@pytest.mark.filterwarnings("ignore::UserWarning")  # Pillow names some damage in passing
 def test_damage_never_escapes(tmp_path, form, data):
     """Whatever bytes are changed: a picture or one ImageError, nothing else."""
     buffer = BytesIO()

@@ -19,8 +19,7 @@ def writing(path: str | os.PathLike, error: type[GsasrError]) -> Iterator[Path]:
     (full disk, no permission, no such folder) becomes `error` with one clear sentence.
     """
     path = Path(path)
-    if path.is_dir():
-        raise error(f"{path} is a folder; give a file name in it.")
+    check_writable(path, error)
     beside = path.with_name(f".{path.stem}-{secrets.token_hex(4)}{path.suffix}")
     try:
         beside.touch()
@@ -32,6 +31,17 @@ def writing(path: str | os.PathLike, error: type[GsasrError]) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # such as a folder that is none; the reason is already told
             beside.unlink()
+
+
+def check_writable(path: str | os.PathLike, error: type[GsasrError]) -> None:
+    """Raise `error` now if `path` cannot be written, before minutes of work, not after."""
+    path = Path(path)
+    if path.is_dir():
+        raise error(f"{path} is a folder; give a file name in it.")
+    if not path.parent.is_dir():
+        raise error(f"The folder {path.parent} does not exist; create it first.")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise error(f"The folder {path.parent} is not writable; choose another.")
 
 
 def shipped(name: str) -> Path:

@@ -1,0 +1,84 @@
+"""Writing a picture file: which pixels, and the work of making them."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from gsasr.errors import RequestError
+from gsasr.view import View, output_length
+
+from .state import Document
+from .worker import Task
+
+BANDS = 24  # steps of progress; cancelling waits for one
+
+
+def region_of(view: View, size: tuple[int, int]) -> View:
+    """The part of a canvas view that lies on the picture (height, width), pixel for pixel.
+
+    Raises RequestError if there is none.
+    """
+    left, top = (max(0, math.ceil(round(v, 6))) for v in view.to_output(0, 0))
+    right, bottom = view.to_output(size[1], size[0])
+    right = min(view.size[1], math.floor(round(right, 6)))
+    bottom = min(view.size[0], math.floor(round(bottom, 6)))
+    if left >= right or top >= bottom:
+        raise RequestError("The view shows nothing of the picture; move it back.")
+    return View(view.to_source(left, top), view.scale, (bottom - top, right - left))
+
+
+def at_scale(region: View, scale: float) -> View:
+    """The source rectangle that `region` shows, at another scale."""
+    if not math.isfinite(scale) or scale <= 0:
+        raise RequestError(f"The scale must be a number above 0, but is {scale:g}.")
+    if region.scale == (scale, scale):
+        return region
+    height, width = (
+        max(1, output_length(side, scale / old))
+        for side, old in zip(region.size, region.scale[::-1], strict=True)
+    )
+    return View(region.origin, (scale, scale), (height, width))
+
+
+def to_size(region: View, size: tuple[int, int]) -> View:
+    """The source rectangle that `region` shows, at exactly `size` (height, width)."""
+    height, width = (
+        side / scale for side, scale in zip(region.size, region.scale[::-1], strict=True)
+    )
+    return View.of_region((*region.origin, width, height), size)
+
+
+def export(task: Task, document: Document, view: View, path: Path) -> None:
+    """Render the Gaussians through a view, exactly, and write them to a picture file.
+
+    The source's alpha, gray, depth and colour profile are kept where the format holds them.
+    Raises GsasrError; a cancelled or failed export leaves no file.
+    """
+    from gsasr import image, rasterize
+    from gsasr.gaussians import Gaussians
+    from gsasr.memory import require_picture
+
+    image.check_output(path)
+    require_picture(view.size)
+    if not document.complete or not document.parts:
+        raise RequestError("Not all Gaussians are there; predict the whole picture first.")
+    task.progress(0.0)
+    field = Gaussians.concatenate(document.parts)
+    color = np.empty((*view.size, 3), np.float32)
+    bounds = np.linspace(0, view.size[0], min(BANDS, view.size[0]) + 1).astype(int).tolist()
+    for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
+        task.check()
+        band = rasterize.render(field, view.rows(start, stop), "cpu", "export")
+        color[start:stop] = band.numpy()
+        task.progress(stop / view.size[0])
+    alpha = None
+    if document.has_alpha:
+        from gsasr.picture import resample_alpha
+
+        alpha = resample_alpha(document.picture.alpha, view)
+    task.check()
+    task.progress(None, f"Writing {path.name}")
+    image.write(path, color, like=document.picture, alpha=alpha)

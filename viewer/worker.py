@@ -1,0 +1,126 @@
+"""One background thread: the window posts work, the work sends back what the window should do.
+
+Only the window's thread touches OpenGL and the state; work therefore hands over plain callables,
+which the window runs between frames, a few at a time.
+"""
+
+from __future__ import annotations
+
+import queue
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable
+
+from gsasr.errors import Cancelled, GsasrError
+
+
+class Task:
+    """One piece of background work, as both threads see it.
+
+    title: what to show while it runs; share: done so far in [0, 1], or None when unknown.
+    """
+
+    def __init__(self, title: str, work: Callable[[Task], None], worker: Worker) -> None:
+        self.title = title
+        self.share: float | None = None
+        self._work = work
+        self._worker = worker
+        self._cancelled = threading.Event()
+
+    def cancel(self) -> None:
+        """Ask the work to stop; it raises Cancelled at its next step."""
+        self._cancelled.set()
+
+    def cancelled(self) -> bool:
+        """Was it asked to stop?"""
+        return self._cancelled.is_set()
+
+    def check(self) -> None:
+        """Raise Cancelled if it was asked to stop."""
+        if self.cancelled():
+            raise Cancelled(f"{self.title} was cancelled.")
+
+    def progress(self, share: float | None, title: str | None = None) -> None:
+        """Tell the window how far it is."""
+        self.share = share
+        self.title = title or self.title
+
+    def show(self, action: Callable[[], None]) -> None:
+        """Have the window's thread call `action`, unless this task is cancelled by then."""
+        self._worker.results.put((self, action))
+
+
+class Worker:
+    """Runs tasks one after another on one thread, and their results on the window's thread."""
+
+    def __init__(self, on_error: Callable[[str], None]) -> None:
+        """on_error: called on the window's thread with one sentence."""
+        self.results: queue.SimpleQueue[tuple[Task | None, Callable[[], None]]] = queue.SimpleQueue()
+        self._on_error = on_error
+        self._tasks: list[Task] = []  # running and waiting, oldest first
+        self._queue: queue.SimpleQueue[Task | None] = queue.SimpleQueue()
+        self._lock = threading.Lock()
+        self._thread = threading.Thread(target=self._run, name="worker", daemon=True)
+        self._thread.start()
+
+    def post(self, title: str, work: Callable[[Task], None]) -> Task:
+        """Run `work(task)` after what was posted before."""
+        task = Task(title, work, self)
+        with self._lock:
+            self._tasks.append(task)
+        self._queue.put(task)
+        return task
+
+    @property
+    def tasks(self) -> list[Task]:
+        """Running and waiting tasks, oldest first."""
+        with self._lock:
+            return list(self._tasks)
+
+    def cancel_all(self) -> None:
+        """Ask everything, running or waiting, to stop."""
+        for task in self.tasks:
+            task.cancel()
+
+    def deliver(self, seconds: float) -> bool:
+        """On the window's thread: run results for about so long, at least one; True if any ran."""
+        deadline = time.perf_counter() + seconds
+        ran = False
+        while not ran or time.perf_counter() < deadline:
+            try:
+                task, action = self.results.get_nowait()
+            except queue.Empty:
+                break
+            if task is None or not task.cancelled():
+                action()
+                ran = True
+        return ran
+
+    def stop(self, seconds: float = 2.0) -> None:
+        """Cancel everything and wait for the thread, but no longer than so many seconds."""
+        self.cancel_all()
+        self._queue.put(None)
+        self._thread.join(seconds)
+
+    def _run(self) -> None:
+        while (task := self._queue.get()) is not None:
+            try:
+                task.check()
+                task._work(task)
+            except Cancelled:
+                pass
+            except GsasrError as error:
+                self._fail(str(error))
+            except MemoryError:
+                self._fail("The memory does not suffice; close other programs or use less.")
+            except Exception as error:  # a mistake of ours must not end the thread
+                traceback.print_exc(file=sys.stderr)
+                self._fail(f"{task.title} failed: {error or type(error).__name__}.")
+            finally:
+                with self._lock:
+                    self._tasks.remove(task)
+
+    def _fail(self, sentence: str) -> None:
+        self.results.put((None, lambda: self._on_error(sentence)))

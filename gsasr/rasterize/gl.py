@@ -78,6 +78,8 @@ class GlTile:
     count: int
     origin: tuple[int, int]
     bounds: tuple[float, float, float, float]
+    extent: tuple[float, float, float, float]
+    largest: float
     records: moderngl.Buffer
     levels: tuple[GlLevel, ...]
 
@@ -140,7 +142,9 @@ class GlRasterizer:
             GlLevel(c.side, c.first, c.shape, *buffers[1 + 2 * i : 3 + 2 * i])
             for i, c in enumerate(tile.levels)
         )
-        return GlTile(len(tile), tile.origin, tile.bounds, buffers[0], levels)
+        return GlTile(
+            len(tile), tile.origin, tile.bounds, tile.extent, tile.largest, buffers[0], levels
+        )
 
     def draw(
         self,
@@ -289,9 +293,9 @@ def runs(
 
 
 def load_shader(ctx: moderngl.Context, name: str, defines: dict[str, object] | None = None) -> str:
-    """Source of shaders/`name`, with `defines` after its version line and its includes known."""
-    if "gaussian.glsl" not in ctx.includes:
-        ctx.includes["gaussian.glsl"] = shipped("shaders/gaussian.glsl").read_text()
+    """Source of shaders/`name` with `defines` after its version line; its includes are resolved."""
+    for path in shipped("shaders").glob("*.glsl"):
+        ctx.includes.setdefault(path.name, path.read_text())
     version, rest = shipped(f"shaders/{name}").read_text().split("\n", 1)
     lines = [version, *(f"#define {key} {value}" for key, value in (defines or {}).items()), rest]
     return "\n".join(lines)

@@ -34,12 +34,16 @@ class PackedTile:
         of shaders/gaussian.glsl, and the peak red, green, blue (opacity * color).
     levels: at least one index, finest first.
     bounds: (x0, y0, x1, y1), source pixels, round all footprints; empty if none is drawn.
+    extent: likewise, round all means.
+    largest: of all standard deviations, source pixels.
     """
 
     origin: tuple[int, int]
     records: np.ndarray
     levels: tuple[Cells, ...]
     bounds: tuple[float, float, float, float]
+    extent: tuple[float, float, float, float]
+    largest: float
 
     def __len__(self) -> int:
         return len(self.records)
@@ -92,7 +96,9 @@ def pack(
     records[:, 4] = FOLD / std[:, 1]
     records[:, 5:8] = _array(gaussians.peak)
     bounds = (x, y, x + columns * finest.side, y + rows * finest.side)
-    return PackedTile(origin, records, tuple(levels), bounds)
+    around = np.concatenate([mean.min(axis=0), mean.max(axis=0)]) if len(mean) else np.zeros(4)
+    extent = tuple(around.tolist())
+    return PackedTile(origin, records, tuple(levels), bounds, extent, float(std.max(initial=0.0)))
 
 
 def visible(gaussians: Gaussians, view: View, quality: str) -> Gaussians:

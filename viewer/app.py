@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 
 # First: it chooses the GLFW library that glfw, below, has to share with it.
-from imgui_bundle import hello_imgui, imgui  # isort: skip
+from imgui_bundle import hello_imgui  # isort: skip
 import glfw
 import moderngl
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui
@@ -31,7 +31,8 @@ class App:
     def __init__(self, session: Session, path: str | None) -> None:
         self.session = session
         self.dialogs = {
-            dialog.name: dialog for dialog in (OpenDialog(), SaveDialog(), ExportDialog(), PredictDialog())
+            dialog.name: dialog
+            for dialog in (OpenDialog(), SaveDialog(), ExportDialog(), PredictDialog())
         }
         self._path = path  # opened after the first frame, so that the window is there at once
         self._frames = 0

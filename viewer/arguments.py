@@ -49,7 +49,9 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 
 def _check(options: argparse.Namespace) -> None:
     if not CONDITION[0] <= options.condition <= CONDITION[1]:
-        raise RequestError(f"The scale of --condition must be {CONDITION[0]:g} to {CONDITION[1]:g}.")
+        raise RequestError(
+            f"The scale of --condition must be {CONDITION[0]:g} to {CONDITION[1]:g}."
+        )
     if not SIGMA[0] <= options.sigma <= SIGMA[1]:
         raise RequestError(f"The size of --sigma must be {SIGMA[0]:g} to {SIGMA[1]:g}.")
     if options.zoom is not None and options.zoom <= 0:

@@ -19,7 +19,7 @@ MARGIN = 0.5  # of the canvas that may lie past the picture's edge
 
 @dataclass(frozen=True)
 class Pose:
-    """origin: (x, y) of the canvas' top left corner, source pixels; scale: canvas px per source px."""
+    """x, y: of the canvas' top left corner, source pixels; scale: canvas per source pixels."""
 
     x: float
     y: float
@@ -153,7 +153,10 @@ class Camera:
     def _clamped(self, pose: Pose) -> Pose:
         """Keep the picture in reach: half a canvas past its edge, no further."""
         x, y = (
-            min(max(origin, -MARGIN * canvas / pose.scale), side - (1 - MARGIN) * canvas / pose.scale)
+            min(
+                max(origin, -MARGIN * canvas / pose.scale),
+                side - (1 - MARGIN) * canvas / pose.scale,
+            )
             for origin, canvas, side in zip(
                 (pose.x, pose.y), self._canvas, self._picture, strict=True
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -69,7 +70,7 @@ def export(task: Task, document: Document, view: View, path: Path) -> None:
     field = Gaussians.concatenate(document.parts)
     color = np.empty((*view.size, 3), np.float32)
     bounds = np.linspace(0, view.size[0], min(BANDS, view.size[0]) + 1).astype(int).tolist()
-    for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
+    for start, stop in pairwise(bounds):
         task.check()
         band = rasterize.render(field, view.rows(start, stop), "cpu", "export")
         color[start:stop] = band.numpy()

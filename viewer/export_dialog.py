@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from pathlib import Path
 
 from imgui_bundle import imgui
@@ -139,10 +140,8 @@ class ExportDialog:
     def _ratio(self, session: Session) -> float:
         height, width = session.state.document.size
         if not self.whole:
-            try:
+            with suppress(GsasrError):
                 height, width = export.region_of(session.camera.view(), (height, width)).size
-            except GsasrError:
-                pass
         return width / height
 
     def _follow(self, session: Session) -> None:

@@ -12,7 +12,19 @@ from imgui_bundle import portable_file_dialogs as native
 from .loading import FIELD_SUFFIX
 from .session import Session
 
-PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".avif", ".bmp", ".gif", ".ppm", ".tga")
+PICTURES = (
+    ".png",
+    ".jpg",
+    ".jpeg",
+    ".webp",
+    ".tif",
+    ".tiff",
+    ".avif",
+    ".bmp",
+    ".gif",
+    ".ppm",
+    ".tga",
+)
 MOST_ENTRIES = 2000  # listed of a folder
 
 
@@ -60,7 +72,10 @@ class OpenDialog:
         button = imgui.calc_text_size("Open").x + 2 * imgui.get_style().frame_padding.x
         imgui.set_next_item_width(-button - imgui.get_style().item_spacing.x)
         entered, self.text = imgui.input_text_with_hint(
-            "##path", "Path of a file or folder", self.text, imgui.InputTextFlags_.enter_returns_true
+            "##path",
+            "Path of a file or folder",
+            self.text,
+            imgui.InputTextFlags_.enter_returns_true,
         )
         imgui.same_line()
         if (imgui.button("Open") or entered) and self.text.strip():

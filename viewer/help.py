@@ -14,7 +14,9 @@ def draw(session: Session) -> None:
         imgui.get_main_viewport().get_center(), imgui.Cond_.appearing, (0.5, 0.5)
     )
     flags = imgui.WindowFlags_.always_auto_resize | imgui.WindowFlags_.no_saved_settings
-    shown, stays = imgui.begin("Keys and mouse###Help", True, flags | imgui.WindowFlags_.no_collapse)
+    shown, stays = imgui.begin(
+        "Keys and mouse###Help", True, flags | imgui.WindowFlags_.no_collapse
+    )
     if shown and imgui.begin_table("keys", 2, imgui.TableFlags_.row_bg):
         rows = [(" or ".join(c.keys), c.label.rstrip(".")) for c in COMMANDS]
         for keys, label in [*MOUSE, *rows]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,21 +18,23 @@ from gsasr.errors import FieldError, ImageError, RequestError
 from .state import Document, Rectangle
 from .worker import Task
 
+if TYPE_CHECKING:
+    from gsasr.gaussians import Gaussians
+    from gsasr.model import GSASR
+    from gsasr.predict import Tile
+
 FIELD_SUFFIX = ".safetensors"
 TILE = 192  # side of a tile, source pixels
-
-# Gaussians of a tile, the same packed for drawing, and the source rectangle they complete
-Arrived = Callable[[object, object, Rectangle], None]
 
 
 class Loader:
     """Opens documents; keeps the last network in memory."""
 
     def __init__(self) -> None:
-        self._model = None
+        self._model: GSASR | None = None
         self._model_name: tuple[str, float] | None = None
 
-    def open(self, task: Task, path: Path) -> tuple[Document, list]:
+    def open(self, task: Task, path: Path) -> tuple[Document, list[tuple[Gaussians, Rectangle]]]:
         """The document in a file, and for a saved field its tiles as (Gaussians, rectangle).
 
         Raises ImageError or FieldError in one sentence.
@@ -43,7 +46,9 @@ class Loader:
         picture = image.read(path)
         return Document(path, to_rgba(picture.color, picture.alpha), picture), []
 
-    def _open_field(self, task: Task, path: Path) -> tuple[Document, list]:
+    def _open_field(
+        self, task: Task, path: Path
+    ) -> tuple[Document, list[tuple[Gaussians, Rectangle]]]:
         from gsasr import rasterize
         from gsasr.gaussians import Gaussians
         from gsasr.memory import require_picture
@@ -68,8 +73,12 @@ class Loader:
         model_name: str,
         condition: float,
         near: Callable[[], tuple[float, float]],
-    ) -> Iterator[tuple[object, Rectangle]]:
-        """Gaussians tile by tile with the rectangle each completes, nearest to `near()` first."""
+        within: tuple[float, float, float, float] | None = None,
+    ) -> Iterator[tuple[Gaussians, Rectangle]]:
+        """Gaussians tile by tile with the rectangle each completes, nearest to `near()` first.
+
+        within: (x0, y0, x1, y1); only the tiles that meet it. Raises Cancelled, CheckpointError.
+        """
         task.progress(None, "Loading the network")
         model = self._load(model_name)
         task.check()
@@ -80,7 +89,7 @@ class Loader:
         document.model, document.condition = model.name, condition
         title = f"Predicting {document.path.name}"
         task.progress(0.0, title)
-        waiting = plan(model, document.size, TILE)
+        waiting = [tile for tile in plan(model, document.size, TILE) if _meets(tile, within)]
         total = len(waiting)
         while waiting:
             task.check()
@@ -94,7 +103,7 @@ class Loader:
             task.progress(1 - len(waiting) / total)
             yield part, (tile.x0, tile.y0, tile.x1, tile.y1)
 
-    def _load(self, name: str):
+    def _load(self, name: str) -> GSASR:
         import torch
 
         import gsasr
@@ -108,6 +117,13 @@ class Loader:
         return self._model
 
 
+def _meets(tile: Tile, within: tuple[float, float, float, float] | None) -> bool:
+    if within is None:
+        return True
+    x0, y0, x1, y1 = within
+    return tile.x0 < x1 and x0 < tile.x1 and tile.y0 < y1 and y0 < tile.y1
+
+
 def to_rgba(color: np.ndarray, alpha: np.ndarray | None) -> np.ndarray:
     """(H, W, 3) and (H, W) float32 in [0, 1] to (H, W, 4) uint8."""
     pixels = np.full((*color.shape[:2], 4), 255, np.uint8)
@@ -119,7 +135,7 @@ def to_rgba(color: np.ndarray, alpha: np.ndarray | None) -> np.ndarray:
     return pixels
 
 
-def split(field) -> Iterator[tuple[object, Rectangle]]:
+def split(field: Gaussians) -> Iterator[tuple[Gaussians, Rectangle]]:
     """A field as tiles of its source picture, so that no tile outgrows a buffer of the GPU."""
     height, width = field.size
     columns, rows = -(-width // TILE), -(-height // TILE)

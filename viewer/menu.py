@@ -29,7 +29,7 @@ _NAMES = {
 
 @cache
 def chord(keys: str) -> int:
-    """"Ctrl+O" as Dear ImGui's key chord."""
+    """ "Ctrl+O" as Dear ImGui's key chord."""
     if keys in _NAMES:
         return int(_NAMES[keys])
     *modifiers, key = keys.split("+")
@@ -61,9 +61,15 @@ def draw(session: Session) -> None:
     for menu in MENUS:
         if imgui.begin_menu(menu):
             for command in COMMANDS:
-                if command.menu == menu and imgui.menu_item(
-                    command.label, command.keys[0], command.checked(session), command.enabled(session)
-                )[0]:
+                if (
+                    command.menu == menu
+                    and imgui.menu_item(
+                        command.label,
+                        command.keys[0],
+                        command.checked(session),
+                        command.enabled(session),
+                    )[0]
+                ):
                     command.act(session)
             if menu == "Overlays":
                 imgui.separator()
@@ -78,4 +84,6 @@ def sigma_slider(session: Session) -> None:
     changed, sigma = imgui.slider_float("Ellipse size", session.state.sigma, *SIGMA, "%.1f σ")
     if changed:
         session.set_sigma(sigma)
-    imgui.set_item_tooltip("Ellipses are drawn where a Gaussian has fallen to exp(-k²/2) of its peak")
+    imgui.set_item_tooltip(
+        "An ellipse at k σ is where a Gaussian has fallen to exp(-k²/2) of its peak"
+    )

@@ -21,6 +21,7 @@ from .state import Rectangle
 FULL = 2.0  # scale from which only Gaussians are shown
 BLOCK = 4  # source pixels per texel of the coverage
 EDGE = 2  # blocks by which coverage keeps off tiles that have not arrived: further than they reach
+REACH = (EDGE + 2) * BLOCK  # source pixels beyond a tile that its arrival can change
 BACKGROUND = (0.085, 0.09, 0.1)  # beyond the picture, sRGB
 
 
@@ -202,7 +203,9 @@ class Scene:
         base = [math.floor(value) for value in view.origin]
         program = self._program
         program["base"] = base
-        program["fraction"] = [value - whole for value, whole in zip(view.origin, base, strict=True)]
+        program["fraction"] = [
+            value - whole for value, whole in zip(view.origin, base, strict=True)
+        ]
         program["pixel"] = [1 / scale for scale in view.scale]
         program["size"] = self.size[::-1]
         program["per_texel"] = coarseness

@@ -11,11 +11,10 @@ from gsasr.view import View
 from . import export, loading
 from .camera import Camera
 from .painter import Painter
-from .scene import Overlay, Scene
+from .scene import REACH, Overlay, Scene
 from .state import CONDITION, OVERLAYS, SIGMA, Document, Message, Rectangle, State
 from .worker import Task, Worker
 
-REACH = 8  # source pixels that Gaussians and their coverage stick out of their tile
 NOTE_SECONDS = 6.0
 KEY_ZOOM = 0.5  # octaves per press of + or -
 KEY_PAN = 0.15  # of the canvas per press of an arrow
@@ -52,7 +51,7 @@ class Session:
 
         def work(task: Task) -> None:
             document, tiles = self._loader.open(task, path)
-            task.show(lambda: self._show(document))
+            self.worker.show(task, lambda: self._show(document))
             if document.picture is not None:
                 tiles = self._loader.predict(task, document, model, condition, self._center)
             self._arrive(task, document, tiles)
@@ -79,9 +78,9 @@ class Session:
             tiles = self._loader.predict(task, document, model, condition, self._center)
             for number, tile in enumerate(tiles):
                 if number == 0:  # until then the old Gaussians stay on screen
-                    task.show(forget)
+                    self.worker.show(task, forget)
                 self._arrive(task, document, [tile], last=False)
-            task.show(lambda: self._complete(document))
+            self.worker.show(task, lambda: self._complete(document))
 
         self.worker.post(f"Predicting {document.path.name}", work)
 
@@ -96,7 +95,7 @@ class Session:
 
             field = Gaussians.concatenate(document.parts)
             replace(field, source=document.path.name).save(path)
-            task.show(lambda: self.note(f"Saved {path}"))
+            self.worker.show(task, lambda: self.note(f"Saved {path}"))
 
         if self.ready:
             self.worker.post(f"Saving {path.name}", work)
@@ -108,7 +107,7 @@ class Session:
         def work(task: Task) -> None:
             export.export(task, document, view, path)
             size = f"{view.size[1]}×{view.size[0]}"
-            task.show(lambda: self.note(f"Exported {size} pixels to {path}"))
+            self.worker.show(task, lambda: self.note(f"Exported {size} pixels to {path}"))
 
         if document is not None:
             self.worker.post(f"Exporting {path.name}", work)
@@ -203,10 +202,10 @@ class Session:
             for piece in split_tiles(part):
                 task.check()
                 packed = pack(piece)
-                task.show(lambda packed=packed: self._add(document, packed))
-            task.show(lambda part=part, core=core: self._cover(document, part, core))
+                self.worker.show(task, lambda packed=packed: self._add(document, packed))
+            self.worker.show(task, lambda part=part, core=core: self._cover(document, part, core))
         if last:
-            task.show(lambda: self._complete(document))
+            self.worker.show(task, lambda: self._complete(document))
 
     def _add(self, document: Document, packed) -> None:
         if document is self.state.document:

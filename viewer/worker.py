@@ -22,11 +22,9 @@ class Task:
     title: what to show while it runs; share: done so far in [0, 1], or None when unknown.
     """
 
-    def __init__(self, title: str, work: Callable[[Task], None], worker: Worker) -> None:
+    def __init__(self, title: str) -> None:
         self.title = title
         self.share: float | None = None
-        self._work = work
-        self._worker = worker
         self._cancelled = threading.Event()
 
     def cancel(self) -> None:
@@ -47,9 +45,9 @@ class Task:
         self.share = share
         self.title = title or self.title
 
-    def show(self, action: Callable[[], None]) -> None:
-        """Have the window's thread call `action`, unless this task is cancelled by then."""
-        self._worker.results.put((self, action))
+
+Action = Callable[[], None]
+Work = Callable[[Task], None]
 
 
 class Worker:
@@ -57,21 +55,25 @@ class Worker:
 
     def __init__(self, on_error: Callable[[str], None]) -> None:
         """on_error: called on the window's thread with one sentence."""
-        self.results: queue.SimpleQueue[tuple[Task | None, Callable[[], None]]] = queue.SimpleQueue()
         self._on_error = on_error
+        self._results: queue.SimpleQueue[tuple[Task | None, Action]] = queue.SimpleQueue()
         self._tasks: list[Task] = []  # running and waiting, oldest first
-        self._queue: queue.SimpleQueue[Task | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[tuple[Task, Work] | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="worker", daemon=True)
         self._thread.start()
 
-    def post(self, title: str, work: Callable[[Task], None]) -> Task:
+    def post(self, title: str, work: Work) -> Task:
         """Run `work(task)` after what was posted before."""
-        task = Task(title, work, self)
+        task = Task(title)
         with self._lock:
             self._tasks.append(task)
-        self._queue.put(task)
+        self._queue.put((task, work))
         return task
+
+    def show(self, task: Task, action: Action) -> None:
+        """From the work: have the window's thread call `action`, unless cancelled by then."""
+        self._results.put((task, action))
 
     @property
     def tasks(self) -> list[Task]:
@@ -90,7 +92,7 @@ class Worker:
         ran = False
         while not ran or time.perf_counter() < deadline:
             try:
-                task, action = self.results.get_nowait()
+                task, action = self._results.get_nowait()
             except queue.Empty:
                 break
             if task is None or not task.cancelled():
@@ -105,10 +107,11 @@ class Worker:
         self._thread.join(seconds)
 
     def _run(self) -> None:
-        while (task := self._queue.get()) is not None:
+        while (item := self._queue.get()) is not None:
+            task, work = item
             try:
                 task.check()
-                task._work(task)
+                work(task)
             except Cancelled:
                 pass
             except GsasrError as error:
@@ -123,4 +126,4 @@ class Worker:
                     self._tasks.remove(task)
 
     def _fail(self, sentence: str) -> None:
-        self.results.put((None, lambda: self._on_error(sentence)))
+        self._results.put((None, lambda: self._on_error(sentence)))

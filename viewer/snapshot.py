@@ -1,0 +1,90 @@
+"""--snapshot: the same view as the window's, rendered without one."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from gsasr import image
+from gsasr.errors import BackendError, RequestError
+
+from .camera import Camera
+from .loading import Loader
+from .scene import REACH, Overlay, Scene, Target
+from .state import Document, Rectangle
+from .worker import Task
+
+
+def run(options: argparse.Namespace) -> None:
+    """Render options.file as the canvas of the window would show it, and write it.
+
+    Only the tiles that the view needs are predicted. Raises GsasrError; nothing is left of a
+    file that could not be written.
+    """
+    image.check_output(options.snapshot)
+    task, loader = Task("Snapshot"), Loader()
+    document, tiles = loader.open(task, Path(options.file))
+    camera = _camera(options, document)
+    view = camera.view()
+    scene = Scene(_context())
+    scene.set_picture(document.pixels)
+    if document.picture is not None and (view.scale[0] > 1 or options.overlay != "none"):
+        left, top = view.to_source(0, 0)
+        right, bottom = view.to_source(view.size[1], view.size[0])
+        within = (left - REACH, top - REACH, right + REACH, bottom + REACH)
+        tiles = _predicted(loader, task, document, options, within)
+    for part, core in tiles:
+        _add(scene, part, core)
+    height, width = view.size
+    target = Target(scene.ctx, (height, width))
+    scene.draw(target, view, Overlay(options.overlay, options.sigma))
+    image.write(options.snapshot, target.read().astype(np.float32) / 255)
+
+
+def _context():
+    from gsasr.rasterize.gl import create_context
+
+    try:
+        return create_context()
+    except BackendError as error:
+        raise BackendError(
+            "No headless OpenGL 4.3 here; install a GPU driver or Mesa (libegl1 and "
+            "libgl1-mesa-dri), or render with gsasr upscale, which needs none."
+        ) from error
+
+
+def _camera(options: argparse.Namespace, document: Document) -> Camera:
+    camera = Camera()
+    camera.resize(*options.size)
+    camera.set_picture(document.size)
+    if options.zoom is not None or options.center is not None:
+        height, width = document.size
+        x, y = options.center or (width / 2, height / 2)
+        if not (0 <= x <= width and 0 <= y <= height):
+            raise RequestError(
+                f"The point of --center lies outside of the {width}x{height} picture."
+            )
+        camera.look_at(x, y, options.zoom or camera.fit_scale)
+    return camera
+
+
+def _predicted(loader: Loader, task: Task, document: Document, options, within: Rectangle):
+    """The tiles that the view needs, with a progress bar where somebody may watch it."""
+    center = (within[0] + within[2]) / 2, (within[1] + within[3]) / 2
+    with tqdm(total=1.0, desc="Predicting", disable=None, bar_format="{l_bar}{bar}") as bar:
+        for tile in loader.predict(
+            task, document, options.model, options.condition, lambda: center, within
+        ):
+            yield tile
+            bar.update(task.share - bar.n)
+
+
+def _add(scene: Scene, part, core: Rectangle) -> None:
+    from gsasr.rasterize.gl import pack, split_tiles
+
+    for piece in split_tiles(part):
+        scene.add_tile(pack(piece))
+    scene.cover(core)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from PIL import Image
 
 from . import rasterize
 from .errors import RequestError
@@ -67,6 +68,23 @@ def upscale(
             picture[rows, columns] += drawn.numpy()
         progress(share)
     return picture
+
+
+def resample_alpha(alpha: np.ndarray, view: View) -> np.ndarray:
+    """(H, W) float32 transparency seen through `view`, bicubic -> (h, w) in [0, 1].
+
+    The network paints colour; transparency is upscaled on its own. Outside the picture it is 0.
+    """
+    height, width = alpha.shape
+    x0, y0 = view.origin
+    x1, y1 = view.to_source(view.size[1], view.size[0])
+    left, top, right, bottom = (
+        max(0, int(np.ceil(beyond))) for beyond in (-x0, -y0, x1 - width, y1 - height)
+    )
+    padded = Image.fromarray(np.pad(alpha, ((top, bottom), (left, right))).astype(np.float32))
+    box = (x0 + left, y0 + top, min(x1 + left, padded.width), min(y1 + top, padded.height))
+    resized = padded.resize((view.size[1], view.size[0]), Image.Resampling.BICUBIC, box)
+    return np.clip(np.asarray(resized), 0, 1)
 
 
 def conditioning_scale(scale: float) -> float:

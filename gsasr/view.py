@@ -41,31 +41,37 @@ class View:
 
     @staticmethod
     def at_scale(image_size: tuple[int, int], scale: float) -> View:
-        """The whole image (height, width) at one scale; floor(scale * side) output pixels.
-
-        Raises RequestError for a scale that is not positive and finite, or that leaves no pixel.
-        """
-        if not math.isfinite(scale) or scale <= 0:
-            raise RequestError(f"The scale must be a number above 0, but is {scale:g}.")
-        height, width = (output_length(side, scale) for side in image_size)
-        if min(height, width) < 1:
-            raise RequestError(
-                f"Scale {scale:g} leaves no pixel of a {image_size[1]}x{image_size[0]} picture; "
-                f"use at least {1 / min(image_size):g}."
-            )
-        return View((0.0, 0.0), (scale, scale), (height, width))
+        """The whole image (height, width) at one scale; floor(scale * side) output pixels."""
+        return View.region_at_scale(_whole(image_size), scale)
 
     @staticmethod
     def to_size(image_size: tuple[int, int], size: tuple[int, int]) -> View:
         """The whole image (height, width) rendered to exactly `size` (height, width)."""
-        return View.of_region((0.0, 0.0, float(image_size[1]), float(image_size[0])), size)
+        return View.region_to_size(_whole(image_size), size)
 
     @staticmethod
-    def of_region(region: tuple[float, float, float, float], size: tuple[int, int]) -> View:
+    def region_at_scale(region: tuple[float, float, float, float], scale: float) -> View:
+        """A region (x, y, width, height) in source pixels at one scale; sides are floored.
+
+        Raises RequestError for a scale that is not positive and finite, or that leaves no pixel.
+        """
+        x, y, width, height = _checked(region)
+        if not math.isfinite(scale) or scale <= 0:
+            raise RequestError(f"The scale must be a number above 0, but is {scale:g}.")
+        size = output_length(height, scale), output_length(width, scale)
+        if min(size) < 1:
+            raise RequestError(
+                f"Scale {scale:g} leaves no pixel of {width:g}x{height:g}; "
+                f"use at least {1 / min(width, height):g}."
+            )
+        return View((x, y), (scale, scale), size)
+
+    @staticmethod
+    def region_to_size(
+        region: tuple[float, float, float, float], size: tuple[int, int]
+    ) -> View:
         """A region (x, y, width, height) in source pixels, rendered to `size` (height, width)."""
-        x, y, width, height = region
-        if not all(math.isfinite(v) for v in region) or width <= 0 or height <= 0:
-            raise RequestError("The region must be X,Y,W,H with W and H above 0.")
+        x, y, width, height = _checked(region)
         if min(size) < 1:
             raise RequestError(f"The output size must be at least 1x1, but is {size[1]}x{size[0]}.")
         return View((x, y), (size[1] / width, size[0] / height), size)
@@ -82,3 +88,15 @@ class View:
         """The band of output rows [start, stop) as a view of its own: same samples."""
         origin = (self.origin[0], self.origin[1] + start / self.scale[1])
         return View(origin, self.scale, (stop - start, self.size[1]))
+
+
+def _whole(image_size: tuple[int, int]) -> tuple[float, float, float, float]:
+    return 0.0, 0.0, float(image_size[1]), float(image_size[0])
+
+
+def _checked(
+    region: tuple[float, float, float, float],
+) -> tuple[float, float, float, float]:
+    if not all(math.isfinite(v) for v in region) or min(region[2:]) <= 0:
+        raise RequestError("The region must be X,Y,W,H with W and H above 0.")
+    return region

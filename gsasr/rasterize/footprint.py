@@ -21,7 +21,7 @@ import torch
 from ..gaussians import Gaussians
 
 TOLERANCE = {"screen": 5e-4, "export": 5e-5}
-GRADIENT_CUT = 4.75**2  # tails of second moments: (1 + k^2/2) exp(-k^2/2) = 1.5e-4
+GRADIENT_CUT = 5.0**2  # tails of second moments: (1 + k^2/2) exp(-k^2/2) = 5e-5
 
 
 def cut(gaussians: Gaussians, quality: str) -> torch.Tensor:

@@ -1,0 +1,258 @@
+"""The `gsasr` command."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Callable
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NoReturn
+
+from .errors import GsasrError, RequestError
+
+BACKENDS = ("auto", "gl", "cpu", "cuda", "reference")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; returns the exit code: 0 for success, 2 for a user's mistake."""
+    options = parser().parse_args(arguments)
+    try:
+        options.run(options)
+    except GsasrError as error:
+        print(f"gsasr: {error}", file=sys.stderr)
+        return 2
+    except MemoryError:
+        print("gsasr: Not enough memory; use a smaller scale or a region.", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("gsasr: stopped.", file=sys.stderr)
+        return 130
+    return 0
+
+
+def upscale(options: argparse.Namespace) -> None:
+    from . import image
+    from .model import load_model
+    from .picture import resample_alpha, upscale
+    from .view import View
+
+    image.check_output(options.output)
+    picture = image.read(options.input)
+    view = View.at_scale(picture.size, options.scale)
+    model = load_model(options.model)
+    with progress("upscaling") as told:
+        color = upscale(model, picture.color, view, options.condition, options.backend, told)
+    alpha = None if picture.alpha is None else resample_alpha(picture.alpha, view)
+    image.write(options.output, color, like=picture, alpha=alpha)
+
+
+def predict(options: argparse.Namespace) -> None:
+    from . import image
+    from .errors import FieldError
+    from .files import check_writable
+    from .model import load_model
+    from .predict import predict
+
+    check_writable(options.output, FieldError)
+    picture = image.read(options.input)
+    model = load_model(options.model)
+    with progress("predicting") as told:
+        field = predict(model, picture.color, options.scale, progress=told)
+    dataclasses.replace(field, source=picture.source).save(options.output)
+
+
+def render(options: argparse.Namespace) -> None:
+    from . import image
+    from .gaussians import Gaussians
+    from .picture import render
+
+    image.check_output(options.output)
+    field = Gaussians.load(options.input)
+    view = chosen_view(field.size, options.scale, options.size, options.region)
+    image.write(options.output, render(field, view=view, backend=options.backend))
+
+
+def info(options: argparse.Namespace) -> None:
+    from .describe import describe
+
+    for name, value in describe(options.input).items():
+        print(f"{name + ':':<22} {value}")
+
+
+def evaluate(options: argparse.Namespace) -> None:
+    from .evaluation.benchmark import benchmark, table
+    from .model import load_model
+
+    model = load_model(options.model)
+    for folder in options.folders:
+        with progress(folder.name) as told:
+            scores = benchmark(model, folder, tuple(options.scales), options.backend, told)
+        print(f"{folder.name}: PSNR dB / SSIM on Y, {model.name}\n")
+        print(table(scores, options.per_image), end="\n\n")
+
+
+def train(options: argparse.Namespace) -> None:
+    from .training import PRESETS, train
+
+    given = {
+        name: getattr(options, name)
+        for name in (field.name for field in dataclasses.fields(PRESETS[options.preset]))
+        if getattr(options, name) is not None
+    }
+    config = dataclasses.replace(PRESETS[options.preset], **given)
+    print(train(options.preset, options.data, options.out, config, options.valid))
+
+
+def chosen_view(
+    image_size: tuple[int, int],
+    scale: float | None,
+    size: tuple[int, int] | None,
+    region: tuple[float, float, float, float] | None,
+):
+    """The View for --scale or --size (height, width), of the whole picture or --region x, y, w, h."""
+    from .view import View
+
+    if (scale is None) == (size is None):
+        raise RequestError("Give either --scale or --size.")
+    region = region or (0.0, 0.0, float(image_size[1]), float(image_size[0]))
+    if scale is not None:
+        return View.region_at_scale(region, scale)
+    return View.region_to_size(region, size)
+
+
+def positive(text: str) -> float:
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be a number above 0, but is {text}")
+    return value
+
+
+def size(text: str) -> tuple[int, int]:
+    """WxH -> (height, width)."""
+    width, _, height = text.lower().partition("x")
+    try:
+        pair = int(height), int(width)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be WxH, such as 1280x720, not {text}") from None
+    if min(pair) < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1x1, not {text}")
+    return pair
+
+
+def region(text: str) -> tuple[float, float, float, float]:
+    """X,Y,W,H in source pixels."""
+    try:
+        x, y, width, height = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be X,Y,W,H in source pixels, not {text}") from None
+    return x, y, width, height
+
+
+@contextmanager
+def progress(label: str):
+    """A bar on stderr, fed with the share done; silent when that is no terminal."""
+    from tqdm import tqdm
+
+    with tqdm(total=1.0, desc=label, disable=None, bar_format="{l_bar}{bar}| {elapsed}") as bar:
+
+        def told(share: float) -> None:
+            bar.update(share - bar.n)
+
+        yield told
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """Says what is wrong with the arguments in one line, without the usage before it."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}; see {self.prog} --help\n")
+
+
+def parser() -> argparse.ArgumentParser:
+    top = OneLineParser(
+        prog="gsasr", description="Pictures as 2D Gaussians, rendered at any scale."
+    )
+    commands = top.add_subparsers(required=True, metavar="COMMAND")
+
+    def command(run: Callable[[argparse.Namespace], None], help: str) -> argparse.ArgumentParser:
+        added = commands.add_parser(
+            run.__name__,
+            help=help,
+            description=help,
+            formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+        )
+        added.set_defaults(run=run)
+        return added
+
+    def add_model(command: argparse.ArgumentParser) -> None:
+        command.add_argument("--model", default="lite", help="preset name or .safetensors file")
+
+    def add_backend(command: argparse.ArgumentParser) -> None:
+        command.add_argument("--backend", choices=BACKENDS, default="auto", help="rasterizer")
+
+    def add_output(command: argparse.ArgumentParser, help: str) -> None:
+        command.add_argument("-o", "--output", type=Path, required=True, help=help)
+
+    c = command(upscale, "enlarge a picture by any factor")
+    c.add_argument("input", type=Path, help="picture")
+    add_output(c, "picture to write (.png, .tif, .jpg, .webp)")
+    c.add_argument("--scale", type=positive, required=True, help="factor, any number above 0")
+    c.add_argument(
+        "--condition", type=positive, help="scale told to the network; default --scale within 1..4"
+    )
+    add_model(c)
+    add_backend(c)
+
+    c = command(predict, "turn a picture into Gaussians")
+    c.add_argument("input", type=Path, help="picture")
+    add_output(c, "file of Gaussians to write (.safetensors)")
+    c.add_argument("--scale", type=positive, default=4.0, help="scale told to the network")
+    add_model(c)
+
+    c = command(render, "draw a file of Gaussians")
+    c.add_argument("input", type=Path, help="file of Gaussians")
+    add_output(c, "picture to write")
+    c.add_argument("--scale", type=positive, help="output pixels per source pixel")
+    c.add_argument("--size", type=size, metavar="WxH", help="output size in pixels")
+    c.add_argument("--region", type=region, metavar="X,Y,W,H", help="part to draw, source pixels")
+    add_backend(c)
+
+    c = command(info, "say what is in a picture, a file of Gaussians or a model")
+    c.add_argument("input", type=Path, help="file")
+
+    c = command(evaluate, "measure PSNR and SSIM on benchmark folders")
+    c.add_argument("folders", type=Path, nargs="+", help="folder with HR/ and LR/x2, LR/x3, ...")
+    c.add_argument("--scales", type=int, nargs="+", default=[2, 3, 4], help="integer scales")
+    c.add_argument("--per-image", action="store_true", help="a row for each picture")
+    add_model(c)
+    add_backend(c)
+
+    add_train(commands.add_parser("train", help="train a network on a folder of pictures"))
+    return top
+
+
+def add_train(c: argparse.ArgumentParser) -> None:
+    from .training.config import PRESETS, TrainConfig
+
+    c.set_defaults(run=train)
+    c.formatter_class = argparse.RawDescriptionHelpFormatter
+    c.description = "Train a network; run the same command again to go on after a kill."
+    c.epilog = f"settings of the preset that can be changed:\n{TrainConfig.__doc__}"
+    c.add_argument("--preset", choices=sorted(PRESETS), default="lite", help="default lite")
+    c.add_argument("--data", type=Path, required=True, help="folder tree of pictures")
+    c.add_argument("--out", type=Path, required=True, help="folder of the run")
+    c.add_argument("--valid", type=Path, help="folder tree of pictures for validation PSNR")
+    for field in dataclasses.fields(TrainConfig):
+        flag = "--" + field.name.replace("_", "-")
+        value = getattr(PRESETS["lite"], field.name)
+        if isinstance(value, tuple):
+            element = int if field.name == "milestones" else float
+            c.add_argument(flag, type=element, nargs="*", metavar="X")
+        else:
+            c.add_argument(flag, type=type(value), metavar="X")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,126 @@
+"""Pictures of any size to Gaussians, and pictures drawn tile by tile."""
+
+import numpy as np
+import pytest
+import torch
+
+from gsasr.errors import Cancelled, RequestError
+from gsasr.model import activate, load_model
+from gsasr.picture import conditioning_scale, render, resample_alpha, upscale
+from gsasr.predict import plan, predict, predict_tiles
+from gsasr.rasterize import reference
+from gsasr.view import View
+
+
+def picture(height: int, width: int) -> np.ndarray:
+    """A smooth coloured wave with some noise, (H, W, 3) float32 in [0, 1]."""
+    y, x = np.mgrid[:height, :width].astype(np.float32)
+    waves = [np.sin(x / 5 + y / 9), np.cos(x / 7), np.sin(y / 4 - x / 11)]
+    noise = np.random.default_rng(0).random((height, width, 3), np.float32)
+    return np.clip(0.5 + 0.3 * np.stack(waves, axis=2) + 0.1 * noise, 0, 1).astype(np.float32)
+
+
+def test_a_picture_of_whole_windows_is_predicted_as_the_network_says(tiny_model):
+    image = picture(8, 12)
+    field = predict(tiny_model, image, 3.0)
+    with torch.inference_mode():
+        raw = tiny_model(torch.from_numpy(image).permute(2, 0, 1)[None], 3.0)[0]
+    expected = activate(raw, (8, 12))
+    assert (field.size, field.model, field.scale) == ((8, 12), "tiny", 3.0)
+    for name, tensor in expected.tensors().items():
+        torch.testing.assert_close(getattr(field, name), tensor)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (2, 3), (5, 7), (13, 30)])
+def test_any_size_is_padded_by_reflection_and_covered_with_gaussians(tiny_model, size):
+    field = predict(tiny_model, picture(*size), 2.0).validate()
+    assert field.size == size
+    assert len(field) >= 4 * size[0] * size[1]
+    covered = render(field, scale=2).max()
+    assert np.isfinite(covered) and covered > 0
+
+
+def test_tiles_cover_the_picture_once(tiny_model):
+    covered = np.zeros((44, 60), int)
+    for tile in plan(tiny_model, (41, 58), tile=16):
+        covered[tile.y0 : tile.y1, tile.x0 : tile.x1] += 1
+    assert (covered == 1).all()
+
+
+def test_tiles_nearest_to_the_point_of_interest_come_first(tiny_model):
+    tiles = plan(tiny_model, (64, 64), tile=16, near=(60, 5))
+    assert (tiles[0].x0, tiles[0].y0) == (48, 0)
+    assert (tiles[-1].x0, tiles[-1].y0) == (0, 48)
+
+
+@pytest.mark.parametrize("tile", [48, 64, 96])
+def test_tiled_prediction_shows_no_seams_with_the_shipped_model(images, tile):
+    from gsasr import image
+
+    model = load_model("lite")
+    photo = image.read(images / "cat.png").color[40:200, 60:220]
+    view = View.at_scale(photo.shape[:2], 2)
+    whole = render(predict(model, photo, 2.0, tile=1024), view=view, backend="cpu")
+    tiled = render(predict(model, photo, 2.0, tile=tile), view=view, backend="cpu")
+    difference = np.abs(whole - tiled)
+    assert np.quantile(difference, 0.999) < 2 / 255
+    # Seams would show as a jump across tile borders that the whole prediction does not have.
+    jumps = np.abs(np.diff(tiled - whole, axis=1)).mean(axis=(0, 2))
+    borders = np.arange(2 * tile, 2 * photo.shape[1] - 1, 2 * tile) - 1
+    assert jumps[borders].mean() < max(2e-3, 3 * np.median(jumps))
+
+
+def test_progress_reaches_the_end_and_cancel_stops_between_tiles(tiny_model):
+    image, shares = picture(40, 40), []
+    predict(tiny_model, image, 2.0, tile=16, progress=shares.append)
+    assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) == 9
+    tiles = predict_tiles(tiny_model, image, tile=16, cancelled=lambda: len(shares) > 10)
+    next(tiles)
+    shares += [0, 0]
+    with pytest.raises(Cancelled):
+        next(tiles)
+
+
+def test_what_cannot_be_predicted_is_refused(tiny_model):
+    for image, scale in (
+        (np.zeros((4, 4)), 2.0),
+        (np.zeros((0, 4, 3)), 2.0),
+        (picture(4, 4), 0.0),
+        (picture(4, 4), float("nan")),
+    ):
+        with pytest.raises(RequestError):
+            predict(tiny_model, image, scale)
+
+
+def test_drawing_tile_by_tile_equals_drawing_the_whole_field(tiny_model):
+    image = picture(40, 52)
+    for view in (View.at_scale((40, 52), 2.7), View((-3.0, 20.5), (3.0, 3.0), (90, 60))):
+        streamed = upscale(tiny_model, image, view, condition=2.0, backend="cpu")
+        oracle = reference.render(predict(tiny_model, image, 2.0), view).numpy()
+        assert np.abs(streamed - oracle).max() < 2e-4
+
+
+def test_the_network_is_told_a_scale_that_it_knows():
+    assert [conditioning_scale(s) for s in (0.3, 2.5, 30)] == [1.0, 2.5, 4.0]
+
+
+def test_exactly_one_size_must_be_given(tiny_model):
+    field = predict(tiny_model, picture(4, 4), 2.0)
+    assert render(field, scale=1.5).shape == (6, 6, 3)
+    assert render(field, size=(3, 5)).shape == (3, 5, 3)
+    for choice in ({}, {"scale": 2, "size": (3, 3)}):
+        with pytest.raises(RequestError, match="exactly one"):
+            render(field, **choice)
+
+
+def test_alpha_keeps_its_place_when_resampled():
+    alpha = np.zeros((6, 8), np.float32)
+    alpha[2:4, 3:6] = 1
+    whole = resample_alpha(alpha, View.at_scale((6, 8), 4))
+    assert whole.shape == (24, 32)
+    assert whole[10:14, 14:22].min() > 0.9 and whole[:4].max() < 0.05
+    ys, xs = np.mgrid[:24, :32]
+    center = (whole * xs).sum() / whole.sum(), (whole * ys).sum() / whole.sum()
+    assert center == pytest.approx((4.5 * 4 - 0.5, 3 * 4 - 0.5), abs=0.01)
+    beyond = resample_alpha(np.ones((6, 8), np.float32), View((-8.0, -6.0), (1.0, 1.0), (18, 24)))
+    assert beyond[6:12, 8:16].mean() > 0.95 and beyond[:4].max() < 0.05

@@ -111,7 +111,7 @@ def chosen_view(
     size: tuple[int, int] | None,
     region: tuple[float, float, float, float] | None,
 ):
-    """The View for --scale or --size (height, width), of the whole picture or --region x, y, w, h."""
+    """The View for --scale or --size (height, width), of the whole picture or of --region."""
     from .view import View
 
     if (scale is None) == (size is None):

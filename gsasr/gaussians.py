@@ -76,16 +76,16 @@ class Gaussians:
     @staticmethod
     def concatenate(parts: list[Gaussians]) -> Gaussians:
         """All of `parts` (at least one) as one; size and origin come from the first."""
-        merged = {
-            name: torch.cat([getattr(part, name) for part in parts]) for name in TENSORS
-        }
+        merged = {name: torch.cat([getattr(part, name) for part in parts]) for name in TENSORS}
         return replace(parts[0], **merged)
 
     def validate(self) -> Gaussians:
         """Itself, or FieldError if a value is not finite or outside its range."""
         for name, tensor in self.tensors().items():
             if not bool(torch.isfinite(tensor).all()):
-                raise FieldError(f"{name} holds values that are not finite; predict the field anew.")
+                raise FieldError(
+                    f"{name} holds values that are not finite; predict the field anew."
+                )
         for name, wrong, rule in (
             ("std", self.std <= 0, "be above 0"),
             ("rho", self.rho.abs() >= 1, "lie strictly between -1 and 1"),
@@ -140,5 +140,3 @@ class Gaussians:
             raise FieldError(
                 f"{path} is damaged or no file of Gaussians; predict the field anew."
             ) from error
-
-

@@ -67,9 +67,7 @@ class View:
         return View((x, y), (scale, scale), size)
 
     @staticmethod
-    def region_to_size(
-        region: tuple[float, float, float, float], size: tuple[int, int]
-    ) -> View:
+    def region_to_size(region: tuple[float, float, float, float], size: tuple[int, int]) -> View:
         """A region (x, y, width, height) in source pixels, rendered to `size` (height, width)."""
         x, y, width, height = _checked(region)
         if min(size) < 1:

@@ -29,9 +29,7 @@ def test_an_exact_size_has_its_own_scale_per_axis():
     assert view.to_source(30, 25) == (20, 10)
 
 
-@given(
-    st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.floats(1e-2, 1e4), st.floats(-5000, 5000)
-)
+@given(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.floats(1e-2, 1e4), st.floats(-5000, 5000))
 def test_mapping_there_and_back_returns_to_the_same_point(x, y, scale, point):
     view = View((x, y), (scale, scale), (10, 10))
     there = view.to_output(*view.to_source(point, -point))

@@ -52,9 +52,7 @@ def benchmark(
             truth = image.read(folder / "HR" / name).color[:height, :width]
             picture = upscale(model, lr, View.at_scale(lr.shape[:2], scale), backend=backend)
             scores.append(
-                Score(
-                    name, scale, psnr_y(picture, truth, scale), ssim_y(picture, truth, scale)
-                )
+                Score(name, scale, psnr_y(picture, truth, scale), ssim_y(picture, truth, scale))
             )
             progress(len(scores) / (len(scales) * len(names)))
     return scores

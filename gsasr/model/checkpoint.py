@@ -33,7 +33,7 @@ def load_model(name: str | os.PathLike = "lite") -> GSASR:
         return _load_file(shipped(SHIPPED[str(name)]), str(name))
     if str(name) in PRESETS:
         raise CheckpointError(
-            f"No trained weights of {name} are shipped; give a .safetensors file of it as the model."
+            f"No trained weights of {name} are shipped; give a .safetensors file of it."
         )
     path = Path(name)
     if not path.is_file():
@@ -81,7 +81,9 @@ def build(
             more = f" and {len(keys) - 1} more" if len(keys) > 1 else ""
             raise CheckpointError(f"{origin} {what} {keys[0]}{more}; it does not fit its network.")
     if not all(bool(torch.isfinite(v).all()) for v in state.values() if v.is_floating_point()):
-        raise CheckpointError(f"{origin} holds weights that are not finite; train or fetch it anew.")
+        raise CheckpointError(
+            f"{origin} holds weights that are not finite; train or fetch it anew."
+        )
     model.load_state_dict(state)
     return model.eval()
 
@@ -95,6 +97,10 @@ def save_model(
     Raises CheckpointError if the file cannot be written; no partial file is left.
     """
     state = {k: v.detach().cpu().contiguous() for k, v in model.state_dict().items()}
-    header = {"format": "gsasr-model", "name": model.name, "config": json.dumps(asdict(model.config))}
+    header = {
+        "format": "gsasr-model",
+        "name": model.name,
+        "config": json.dumps(asdict(model.config)),
+    }
     with writing(path, CheckpointError) as beside:
         save_file(state, beside, header | (metadata or {}))

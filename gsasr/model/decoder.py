@@ -1,4 +1,4 @@
-"""The Gaussian decoder: features and a target scale -> nine raw numbers per Gaussian (paper Sec. 3).
+"""The Gaussian decoder: features and a target scale -> nine raw numbers per Gaussian (Sec. 3).
 
 Each window of the feature map gets a grid of learned Gaussian embeddings. Condition injection
 (window cross-attention) tells them what the picture shows there, Gaussian interaction blocks
@@ -149,7 +149,11 @@ class GaussianDecoder(nn.Module):
 
 def head(dim: int, hidden: int, columns: int) -> nn.Sequential:
     return nn.Sequential(
-        nn.Linear(dim, dim), nn.ReLU(), nn.Linear(dim, hidden), nn.ReLU(), nn.Linear(hidden, columns)
+        nn.Linear(dim, dim),
+        nn.ReLU(),
+        nn.Linear(dim, hidden),
+        nn.ReLU(),
+        nn.Linear(hidden, columns),
     )
 
 

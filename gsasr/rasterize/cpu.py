@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 import numba
 import numpy as np
@@ -185,7 +186,7 @@ def _threads() -> int:
 
 
 def _pairs(bounds: np.ndarray) -> list[tuple[int, int]]:
-    return [(int(a), int(b)) for a, b in zip(bounds[:-1], bounds[1:], strict=True) if a < b]
+    return [(int(a), int(b)) for a, b in pairwise(bounds) if a < b]
 
 
 def _run(kernel, calls: list[tuple]) -> None:

@@ -73,9 +73,7 @@ def train(
     return out / "model.safetensors"
 
 
-def train_step(
-    state: TrainState, samples: list[Sample], rate: float, config: TrainConfig
-) -> float:
+def train_step(state: TrainState, samples: list[Sample], rate: float, config: TrainConfig) -> float:
     """One step of Adam on a batch; returns its L1 loss."""
     for group in state.optimizer.param_groups:
         group["lr"] = rate

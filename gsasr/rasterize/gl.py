@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import math
 import threading
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -18,7 +19,7 @@ import numpy as np
 
 from ..errors import BackendError, RequestError
 from ..files import shipped
-from .tiles import PackedTile, pack, split_tiles, visible
+from .tiles import CELL_SIDES, PackedTile, pack, split_tiles, visible
 
 if TYPE_CHECKING:
     from ..gaussians import Gaussians
@@ -45,7 +46,7 @@ RUN = np.dtype([("pixel", "i4"), ("count", "i4"), ("cell", "i4"), ("offset", "f4
 
 @dataclass(frozen=True)
 class Shape:
-    """How a workgroup covers a cell (see rasterize.comp); from `reach` pixels per cell on."""
+    """How a workgroup covers a cell (see rasterize.comp); for cells of `reach` pixels or more."""
 
     rows: int
     runs: int
@@ -55,9 +56,10 @@ class Shape:
 
 
 # Software runs 8 threads in step and pays most for loading a Gaussian, so a thread covers as much
-# as it can, and all threads read the same list. A GPU wants many threads.
-SOFTWARE_SHAPES = (Shape(8, 1, 16, 2, 12.0), Shape(8, 1, 8, 1, 0.0))
-HARDWARE_SHAPES = (Shape(8, 8, 8, 1, 0.0),)
+# as it can, and all threads read the same list. A GPU wants many threads. Found by measuring
+# (benchmarks/gl_frame.py), for GPUs a guess.
+SOFTWARE_SHAPES = (Shape(8, 1, 16, 2, 9.0), Shape(8, 1, 8, 1, 6.0), Shape(2, 4, 2, 1, 2.0))
+HARDWARE_SHAPES = (Shape(8, 8, 8, 1, 6.0), Shape(2, 32, 2, 1, 2.0))
 
 
 @dataclass(frozen=True)
@@ -174,7 +176,8 @@ class GlRasterizer:
         for tile in tiles:
             if not tile.meets(view):
                 continue
-            level, shape = self._choose(tile, view)
+            index, shape = choose([level.side for level in tile.levels], view, self._shapes)
+            level = tile.levels[index]
             if (level.side, shape) not in axes:
                 columns = runs(view.origin[0], view.scale[0], 0, width, level.side, shape.pixels)
                 lines = shape.rows * shape.lines
@@ -183,6 +186,10 @@ class GlRasterizer:
                 self._upload_runs((level.side, shape), np.concatenate([columns, bands]))
             self._draw_tile(tile, level, shape, view, target, *axes[level.side, shape])
         self.ctx.memory_barrier()
+
+    def side(self, view: View) -> float:
+        """The side of the cells that `draw` reads at this scale, source pixels: see pack."""
+        return CELL_SIDES[choose(CELL_SIDES, view, self._shapes)[0]]
 
     def release(self) -> None:
         """Free the programs and buffers (not the tiles, nor the context)."""
@@ -195,10 +202,6 @@ class GlRasterizer:
         framebuffer = self.ctx.framebuffer([target])
         framebuffer.clear(alpha=1.0, viewport=(0, start, target.width, stop - start))
         framebuffer.release()
-
-    def _choose(self, tile: GlTile, view: View) -> tuple[GlLevel, Shape]:
-        """The finest level whose cells fill a workgroup, or the coarsest."""
-        return choose(tile.levels, math.sqrt(view.scale[0] * view.scale[1]), self._shapes)
 
     def _upload_runs(self, key: tuple[float, Shape], data: np.ndarray) -> None:
         buffer = self._runs.get(key)
@@ -253,16 +256,18 @@ class GlRasterizer:
         return self._programs[shape, target]
 
 
-def choose(levels, scale: float, shapes: tuple[Shape, ...]):
-    """The first shape that a level's cells fill, with the finest such level; or the coarsest.
+def choose(sides: Sequence[float], view: View, shapes: tuple[Shape, ...]) -> tuple[int, Shape]:
+    """The first shape that the cells of some level fill, and the index of the finest such level.
 
-    levels: of anything with a `side`, ascending; scale: output pixels per source pixel.
+    sides: of the cells of each level, source pixels, ascending. Where none fills any shape, the
+    coarsest level and the last shape.
     """
+    scale = math.sqrt(view.scale[0] * view.scale[1])
     for shape in shapes:
-        for level in levels:
-            if level.side * scale >= max(shape.reach, shape.pixels * 0.75):
-                return level, shape
-    return levels[-1], shapes[-1]
+        for index, side in enumerate(sides):
+            if side * scale >= shape.reach:
+                return index, shape
+    return len(sides) - 1, shapes[-1]
 
 
 def runs(
@@ -364,8 +369,9 @@ def _render(gaussians: Gaussians, view: View, quality: str) -> np.ndarray:
         return image
     tiles = []
     try:
+        sides = (rasterizer.side(view),)
         for part in split_tiles(visible(gaussians, view, quality)):
-            tiles.append(rasterizer.upload(pack(part, quality)))
+            tiles.append(rasterizer.upload(pack(part, quality, sides)))
         most = min(BLOCK, rasterizer.ctx.info["GL_MAX_TEXTURE_SIZE"])
         for x in range(0, width, most):
             columns = min(most, width - x)

@@ -209,6 +209,19 @@ def test_pictures_larger_than_a_piece_agree_with_the_reference(monkeypatch):
     assert error(gaussians, View((-1.0, -1.0), (7.7, 7.7), (131, 150))) < 1e-4
 
 
+def test_fields_larger_than_what_is_held_at_once_agree_with_the_reference(monkeypatch):
+    monkeypatch.setattr(gl, "HELD", 1)
+    monkeypatch.setattr(gl, "split_tiles", lambda gaussians: tiles.split_tiles(gaussians, 8))
+    gaussians = random_gaussians()
+    assert error(gaussians, View((-1.0, -1.0), (7.7, 7.7), (131, 150))) < 1e-4
+
+
+def test_drawing_causes_no_error_of_the_driver(gl_context, rasterizer):
+    gaussians = random_gaussians()
+    draw(rasterizer, [rasterizer.upload(gaussians)], View.at_scale(gaussians.size, 3))
+    assert gl_context.error == "GL_NO_ERROR"
+
+
 def test_runs_cover_every_pixel_once_and_stay_inside_a_cell():
     rng = np.random.default_rng(0)
     for _ in range(200):

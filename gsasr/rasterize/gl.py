@@ -40,6 +40,7 @@ SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software rasterizer", "swiftshade
 TARGETS = {"f2": "rgba16f", "f4": "rgba32f"}
 BLOCK = 4096  # widest piece that `render` draws at once, pixels
 PIXELS = 1 << 22  # most pixels in such a piece: 64 MiB
+HELD = 1 << 29  # bytes of tiles that `render` holds on the GPU at once, about
 
 RUN = np.dtype([("pixel", "i4"), ("count", "i4"), ("cell", "i4"), ("offset", "f4")])
 
@@ -127,19 +128,15 @@ class GlRasterizer:
         """
         if not isinstance(tile, PackedTile):
             tile = pack(tile, quality)
-        buffers: list[moderngl.Buffer] = []
-        try:
-            for array in (tile.records, *(a for c in tile.levels for a in (c.offsets, c.entries))):
-                # A buffer cannot be empty.
-                buffers.append(
-                    self.ctx.buffer(array) if array.size else self.ctx.buffer(reserve=32)
-                )
-        except moderngl.Error as failure:
+        arrays = [tile.records, *(a for c in tile.levels for a in (c.offsets, c.entries))]
+        # A buffer cannot be empty.
+        buffers = [self.ctx.buffer(a) if a.size else self.ctx.buffer(reserve=32) for a in arrays]
+        if self.ctx.error == "GL_OUT_OF_MEMORY":
             for buffer in buffers:
                 buffer.release()
             raise BackendError(
                 "The GPU is out of memory; close other programs or use --backend cpu."
-            ) from failure
+            )
         levels = tuple(
             GlLevel(c.side, c.first, c.shape, *buffers[1 + 2 * i : 3 + 2 * i])
             for i, c in enumerate(tile.levels)
@@ -363,26 +360,37 @@ def _headless() -> GlRasterizer:
 
 def _render(gaussians: Gaussians, view: View, quality: str) -> np.ndarray:
     rasterizer = _headless()
-    height, width = view.size
-    image = np.zeros((height, width, 3), np.float32)
+    image = np.zeros((*view.size, 3), np.float32)
     if image.size == 0 or len(gaussians) == 0:
         return image
-    tiles = []
+    sides = (rasterizer.side(view),)
+    held: list[GlTile] = []
     try:
-        sides = (rasterizer.side(view),)
         for part in split_tiles(visible(gaussians, view, quality)):
-            tiles.append(rasterizer.upload(pack(part, quality, sides)))
-        most = min(BLOCK, rasterizer.ctx.info["GL_MAX_TEXTURE_SIZE"])
-        for x in range(0, width, most):
-            columns = min(most, width - x)
-            rows = max(1, min(most, PIXELS // columns))
-            for y in range(0, height, rows):
-                piece = _piece(view, x, y, columns, min(rows, height - y))
-                image[y : y + piece.size[0], x : x + columns] = _draw(rasterizer, tiles, piece)
+            held.append(rasterizer.upload(pack(part, quality, sides)))
+            if sum(tile.nbytes for tile in held) > HELD:
+                _add(rasterizer, held, view, image)
+        _add(rasterizer, held, view, image)
     finally:
-        for tile in tiles:
+        for tile in held:
             tile.release()
     return image
+
+
+def _add(rasterizer: GlRasterizer, tiles: list[GlTile], view: View, image: np.ndarray) -> None:
+    """Add the tiles to the image, piece by piece of what a texture holds, and free them."""
+    height, width = view.size
+    most = min(BLOCK, rasterizer.ctx.info["GL_MAX_TEXTURE_SIZE"])
+    for x in range(0, width, most):
+        columns = min(most, width - x)
+        rows = max(1, min(most, PIXELS // columns))
+        for y in range(0, height, rows):
+            piece = _piece(view, x, y, columns, min(rows, height - y))
+            if any(tile.meets(piece) for tile in tiles):
+                drawn = _draw(rasterizer, tiles, piece)
+                image[y : y + piece.size[0], x : x + columns] += drawn
+    while tiles:
+        tiles.pop().release()
 
 
 def _piece(view: View, x: int, y: int, width: int, height: int) -> View:

@@ -222,6 +222,17 @@ def test_drawing_causes_no_error_of_the_driver(gl_context, rasterizer):
     assert gl_context.error == "GL_NO_ERROR"
 
 
+def test_warming_up_compiles_every_program_and_draws_nothing(gl_context, rasterizer):
+    rasterizer.warm_up("f4")
+    assert len(rasterizer._programs) == len(rasterizer._shapes)
+    gaussians = random_gaussians()
+    view = View.at_scale(gaussians.size, 3)
+    drawn = draw(rasterizer, [rasterizer.upload(gaussians)], view)
+    assert np.abs(drawn - reference.render(gaussians, view).numpy()).max() < 1e-3
+    assert len(rasterizer._programs) == len(rasterizer._shapes)
+    assert gl_context.error == "GL_NO_ERROR"
+
+
 def test_runs_cover_every_pixel_once_and_stay_inside_a_cell():
     rng = np.random.default_rng(0)
     for _ in range(200):

@@ -121,6 +121,20 @@ class GlRasterizer:
         self._programs: dict[tuple[Shape, str], moderngl.ComputeShader] = {}
         self._runs: dict[tuple[float, Shape], moderngl.Buffer] = {}
 
+    def warm_up(self, dtype: str = "f2") -> None:
+        """Compile all that `draw` will need for such a target, lest a first frame stutter.
+
+        Some drivers, software among them, compile when a program first runs: so it runs.
+        """
+        target = self.ctx.texture((1, 1), 4, dtype=dtype)
+        target.bind_to_image(0, read=True, write=True)
+        for shape in self._shapes:
+            program = self._program(shape, TARGETS[dtype])
+            program["window"] = 0, 0, 0  # no runs: every thread ends at once
+            program.run(1, 1)
+        self.ctx.finish()
+        target.release()
+
     def upload(self, tile: PackedTile | Gaussians, quality: str = "screen") -> GlTile:
         """The tile on the GPU. Gaussians are packed first, which is better done on a worker.
 

@@ -1,5 +1,8 @@
 """Fixtures shared by several test files."""
 
+import os
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -33,6 +36,30 @@ def images() -> Path:
 
 @pytest.fixture
 def tiny_model():
+    """See make_tiny_model."""
+    return make_tiny_model()
+
+
+@pytest.fixture(scope="session")
+def display():
+    """Name of an X display of our own, so that nobody's mouse is in the way; else of the user's."""
+    if shutil.which("Xvfb") is None:
+        if not os.environ.get("DISPLAY"):
+            pytest.skip("There is no display, and Xvfb, which makes one, is not installed.")
+        yield os.environ["DISPLAY"]
+        return
+    read, write = os.pipe()
+    command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x800x24", "-nolisten", "tcp"]
+    server = subprocess.Popen(command, pass_fds=[write], stderr=subprocess.DEVNULL)
+    os.close(write)
+    with os.fdopen(read) as number:
+        name = number.readline().strip()  # written once it accepts connections
+    yield f":{name}"
+    server.terminate()
+    server.wait()
+
+
+def make_tiny_model():
     """An untrained network that runs in milliseconds, 4 Gaussians per pixel, window 4."""
     from gsasr.model import GSASR, ModelConfig
     from gsasr.model.decoder import DecoderConfig

@@ -14,7 +14,7 @@ from imgui_bundle.glfw_utils import glfw_window_hello_imgui
 
 from gsasr.errors import BackendError
 
-from . import canvas, help, menu, status, theme
+from . import canvas, help, menu, overlay_panel, status, theme
 from .export_dialog import ExportDialog, PredictDialog
 from .file_dialogs import OpenDialog, SaveDialog
 from .scene import Scene
@@ -59,6 +59,7 @@ class App:
         menu.handle_keys(session)
         menu.draw(session)
         canvas.draw(session, status.height())
+        overlay_panel.draw(session)
         status.draw(session)
         for name in sorted(session.state.dialogs):
             if name == "Help":

@@ -8,7 +8,6 @@ from imgui_bundle import imgui
 
 from .keys import COMMANDS, MENUS
 from .session import Session
-from .state import SIGMA
 
 _MODIFIERS = {"Ctrl": imgui.Key.mod_ctrl, "Shift": imgui.Key.mod_shift, "Alt": imgui.Key.mod_alt}
 _NAMES = {
@@ -71,19 +70,5 @@ def draw(session: Session) -> None:
                     )[0]
                 ):
                     command.act(session)
-            if menu == "Overlays":
-                imgui.separator()
-                sigma_slider(session)
             imgui.end_menu()
     imgui.end_main_menu_bar()
-
-
-def sigma_slider(session: Session) -> None:
-    """The size at which ellipses are drawn."""
-    imgui.set_next_item_width(9 * imgui.get_font_size())
-    changed, sigma = imgui.slider_float("Ellipse size", session.state.sigma, *SIGMA, "%.1f σ")
-    if changed:
-        session.set_sigma(sigma)
-    imgui.set_item_tooltip(
-        "An ellipse at k σ is where a Gaussian has fallen to exp(-k²/2) of its peak"
-    )

@@ -27,6 +27,7 @@ class Painter:
         self.target: Target | None = None
         self.seconds = 0.0  # that the last drawing took
         self.coarseness = 1  # of what is on screen now
+        self.overlay_drawn = True  # False where Gaussians lie too close together on screen
         self._scene = scene
         self._cost = 2e-7  # seconds per sample of Gaussians; learned
         self._shown: tuple[View, Overlay] | None = None
@@ -93,7 +94,7 @@ class Painter:
 
     def _draw(self, view: View, overlay: Overlay, rows: tuple[int, int], coarseness: int) -> None:
         start = time.perf_counter()
-        self._scene.draw(self.target, view, overlay, rows, coarseness)
+        self.overlay_drawn = self._scene.draw(self.target, view, overlay, rows, coarseness)
         self._scene.ctx.finish()
         self.seconds = time.perf_counter() - start
         if self._gaussians(view):

@@ -153,8 +153,10 @@ class Scene:
         overlay: Overlay,
         rows: tuple[int, int] | None = None,
         coarseness: int = 1,
-    ) -> None:
+    ) -> bool:
         """Draw output rows [start, stop) of a view (default: all) into the target.
+
+        Returns whether there was an overlay to draw: close-lying Gaussians have none.
 
         coarseness: output pixels per computed sample of the Gaussians along each axis; the
             source, the overlay and the picture's edge are always drawn exactly.
@@ -162,14 +164,16 @@ class Scene:
         start, stop = rows or (0, view.size[0])
         framebuffer = target.framebuffer
         framebuffer.scissor = (0, start, view.size[1], stop - start)
+        drawn = False
         if self._source is None:
             framebuffer.use()
             framebuffer.clear(*BACKGROUND, 1.0)
         else:
             self._draw_picture(framebuffer, view, start, stop, coarseness, self.has_alpha)
             if overlay.kind != "none" and self.tiles:
-                self._draw_overlay(framebuffer, view, overlay)
+                drawn = self._draw_overlay(framebuffer, view, overlay)
         framebuffer.scissor = None
+        return drawn
 
     def color_at(self, view: View, x: int, y: int) -> tuple[int, int, int] | None:
         """8-bit RGB that the picture (no overlay, no checkerboard) has at an output pixel."""
@@ -221,12 +225,12 @@ class Scene:
 
     def _draw_overlay(
         self, framebuffer: moderngl.Framebuffer, view: View, overlay: Overlay
-    ) -> None:
+    ) -> bool:
         if self._overlays is None:
             from .overlays import Overlays
 
             self._overlays = Overlays(self.ctx)
-        self._overlays.draw(self.tiles, view, framebuffer, kind=overlay.kind, sigma=overlay.sigma)
+        return self._overlays.draw(self.tiles, view, framebuffer, overlay.kind, overlay.sigma)
 
     def _field_texture(self, size: tuple[int, int]) -> moderngl.Texture:
         """A texture (h, w) for sums of Gaussians; kept while the size stays."""

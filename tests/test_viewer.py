@@ -1,0 +1,106 @@
+"""The real program, in a real window, used as a person would use it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import viewer_scenarios as scenarios
+from conftest import make_tiny_model
+
+from gsasr.model import save_model
+
+pytestmark = pytest.mark.ui
+
+ROOT = Path(__file__).parent.parent
+SCENARIOS = [*(scenario.__name__ for scenario in scenarios.SCENARIOS), "leaves_no_files_behind"]
+
+
+def viewer(*arguments: object, environment: dict[str, str] | None = None, cwd: Path = ROOT):
+    """The finished process of `python -m viewer ARGUMENTS`."""
+    return subprocess.run(
+        [sys.executable, "-m", "viewer", *map(str, arguments)],
+        cwd=cwd,
+        env=os.environ | {"PYTHONPATH": str(ROOT)} | (environment or {}),
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """With a network that runs in milliseconds, at model.safetensors."""
+    path = tmp_path_factory.mktemp("viewer")
+    save_model(make_tiny_model(), path / "model.safetensors")
+    return path
+
+
+@pytest.fixture(scope="module")
+def results(folder, display, tmp_path_factory) -> dict[str, str]:
+    """Name -> traceback or "" of all scenarios, played in one window."""
+    done = subprocess.run(
+        [sys.executable, ROOT / "tests" / "viewer_scenarios.py", folder],
+        cwd=tmp_path_factory.mktemp("empty"),
+        env=os.environ | {"DISPLAY": display, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    lines = [line for line in done.stdout.splitlines() if line.startswith("{")]
+    assert lines, done.stdout + done.stderr
+    return json.loads(lines[-1])
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_scenario(results, name):
+    assert name in results, f"did not run; ran {sorted(results)}"
+    if results[name]:
+        pytest.fail(results[name], pytrace=False)
+
+
+@pytest.mark.skipif(shutil.which("xdotool") is None, reason="needs xdotool")
+def test_mouse_and_keys_of_the_desktop(folder, display):
+    """The same through X and GLFW: what the test engine presses does not pass through those."""
+    script = ROOT / "tests" / "viewer_desktop.py"
+    done = subprocess.run(
+        [sys.executable, script, folder],
+        cwd=folder,
+        env=os.environ | {"DISPLAY": display, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_without_a_display_it_names_the_way_without_one(images):
+    environment = {"DISPLAY": "", "WAYLAND_DISPLAY": ""}
+    done = viewer(images / "cat.png", environment=environment)
+    assert done.returncode == 2
+    assert "--snapshot" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["missing.png"], "missing.png does not exist"),
+        (["missing.safetensors"], "missing.safetensors does not exist"),
+        (["."], "is a folder"),
+        (["--size", "12"], "--size"),
+        (["--zoom", "-1", "--snapshot", "out.png"], "--zoom"),
+        (["--snapshot", "out.png"], "picture"),
+        (["--no-such-option"], "--no-such-option"),
+    ],
+)
+def test_a_mistake_on_the_command_line_is_one_sentence(arguments, part):
+    done = viewer(*arguments)
+    assert done.returncode == 2
+    assert part in done.stderr
+    assert done.stderr.count("\n") == 1, done.stderr

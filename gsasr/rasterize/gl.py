@@ -19,11 +19,11 @@ import numpy as np
 
 from ..errors import BackendError, RequestError
 from ..files import shipped
+from ..view import View
 from .tiles import CELL_SIDES, PackedTile, pack, split_tiles, visible
 
 if TYPE_CHECKING:
     from ..gaussians import Gaussians
-    from ..view import View
 
 __all__ = [
     "GlRasterizer",
@@ -408,8 +408,6 @@ def _add(rasterizer: GlRasterizer, tiles: list[GlTile], view: View, image: np.nd
 
 
 def _piece(view: View, x: int, y: int, width: int, height: int) -> View:
-    from ..view import View
-
     return View(view.to_source(x, y), view.scale, (height, width))
 
 

@@ -1,6 +1,6 @@
 """Moves the real mouse over the real window (xdotool) and watches where the camera goes.
 
-    python tests/viewer_desktop.py FOLDER
+python tests/viewer_desktop.py FOLDER
 """
 
 from __future__ import annotations
@@ -47,11 +47,7 @@ def play(application) -> None:
     x, y = camera.view().to_output(*held)
     assert abs(x - at[0]) < 0.5 and abs(y - at[1]) < 0.5, (x, y, at)
 
-    xdotool("mousedown", 1)
-    xdotool("mousemove", 360, 280)
-    time.sleep(1)
-    print(session.state.cursor, camera.view().to_output(*held), at)
-    xdotool("mouseup", 1)
+    xdotool("mousedown", 1, "mousemove_relative", "--sync", 60, 30, "mouseup", 1)
     until(lambda: abs(camera.view().to_output(*held)[0] - at[0] - 60) < 0.5)
     assert abs(camera.view().to_output(*held)[1] - at[1] - 30) < 0.5
 

@@ -52,7 +52,9 @@ def draw(session: Session, bottom: float) -> None:
 
 def _mouse(session: Session, corner: imgui.ImVec2, density: float) -> None:
     io, camera = imgui.get_io(), session.camera
-    hovered, dragged = imgui.is_item_hovered(), imgui.is_item_active()
+    hovered = imgui.is_item_hovered()
+    # A quick release comes in the same frame as the last move.
+    dragged = imgui.is_item_active() or imgui.is_item_deactivated()
     before = session.state.cursor
     if not (hovered or dragged) or not imgui.is_mouse_pos_valid():
         session.state.cursor = session.state.color = None

@@ -102,6 +102,14 @@ class Scene:
         self._source = self._coverage = None
         self.size = (0, 0)
 
+    def release(self) -> None:
+        """Free everything on the GPU; the scene cannot be used any more."""
+        self.clear()
+        self._pixel.release()
+        for held in (self._field, self._rasterizer, self._overlays, self._triangle, self._program):
+            if held is not None:
+                held.release()
+
     def clear_tiles(self) -> None:
         """Forget the Gaussians, keep the picture."""
         for tile in self.tiles:
@@ -117,6 +125,7 @@ class Scene:
             from gsasr.rasterize.gl import GlRasterizer
 
             self._rasterizer = GlRasterizer(self.ctx)
+            self._rasterizer.warm_up()
         self.tiles.append(self._rasterizer.upload(packed))
 
     def cover(self, core: Rectangle) -> None:

@@ -1,5 +1,19 @@
-"""One formula, several targets: Gaussians and a view to pixels."""
+"""One formula, several targets: Gaussians and a view to pixels.
 
-from .render import BACKENDS, available_backends, render
+The names are loaded when first used, so that a window can draw (`rasterize.gl`) before PyTorch
+is in.
+"""
+
+from __future__ import annotations
+
+import importlib
 
 __all__ = ["BACKENDS", "available_backends", "render"]
+
+
+def __getattr__(name: str):
+    if name not in __all__:
+        raise AttributeError(f"module 'gsasr.rasterize' has no attribute {name!r}")
+    value = getattr(importlib.import_module(".backends", __name__), name)
+    globals()[name] = value
+    return value

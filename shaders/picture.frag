@@ -1,10 +1,13 @@
 #version 430 core
 // The picture as the window shows it: the source below 1:1, the Gaussians above, a blend between,
 // the source again where Gaussians have not arrived, and nothing outside of the picture.
+//
+// WITH_SOURCE, WITH_FIELD, WITH_OVERLAY: what is needed. MAGNIFIED: more than 1:1.
 
 layout(binding = 0) uniform sampler2D source;  // RGBA, sRGB-encoded, mip-mapped, not premultiplied
 layout(binding = 1) uniform sampler2D field;  // sum of Gaussians for this view
 layout(binding = 2) uniform sampler2D coverage;  // 1 where all Gaussians have arrived
+layout(binding = 3) uniform sampler2D overlay;  // RGBA of this view, premultiplied
 
 uniform ivec2 base;  // the view's origin is base + fraction, source pixels: exact at any zoom
 uniform vec2 fraction;
@@ -12,12 +15,13 @@ uniform vec2 pixel;  // source pixels per output pixel
 uniform ivec2 size;  // of the picture, source pixels
 uniform int per_texel;  // output pixels per texel of the field, along each axis
 uniform float share;  // of the Gaussians, in [0, 1]; the rest is the source
-uniform vec2 covered_size;  // source pixels that the coverage texture spans
+uniform vec2 covered;  // source pixels that the coverage texture spans
 uniform bool has_alpha;
 uniform vec3 background;
 
 layout(location = 0) out vec4 result;
 
+#ifdef MAGNIFIED
 vec4 texel(ivec2 at) { return texelFetch(source, clamp(at, ivec2(0), size - 1), 0); }
 
 vec4 weights(float t)  // Catmull-Rom, for the texels -1, 0, 1, 2
@@ -27,7 +31,7 @@ vec4 weights(float t)  // Catmull-Rom, for the texels -1, 0, 1, 2
         t * (0.5 + t * (2.0 - 1.5 * t)), t * t * (0.5 * t - 0.5));
 }
 
-vec4 bicubic(ivec2 at, vec2 inside)
+vec4 from_source(ivec2 at, vec2 inside)
 {
     vec2 t = inside - 0.5;
     ivec2 left = at - ivec2(lessThan(t, vec2(0.0)));
@@ -37,13 +41,22 @@ vec4 bicubic(ivec2 at, vec2 inside)
         for (int i = 0; i < 4; ++i) sum += x[i] * y[j] * texel(left + ivec2(i - 1, j - 1));
     return clamp(sum, 0.0, 1.0);
 }
-
+#else
 vec4 from_source(ivec2 at, vec2 inside)
 {
-    if (max(pixel.x, pixel.y) < 1.0) return bicubic(at, inside);
     vec2 whole = vec2(size);
     return textureGrad(
         source, (vec2(at) + inside) / whole, vec2(pixel.x / whole.x, 0.0), vec2(0.0, pixel.y / whole.y));
+}
+#endif
+
+vec3 from_field()
+{
+    vec2 where = gl_FragCoord.xy / float(per_texel);
+    return clamp(
+        per_texel == 1 ? texelFetch(field, ivec2(where), 0).rgb
+                       : texture(field, where / vec2(textureSize(field, 0))).rgb,
+        0.0, 1.0);
 }
 
 vec3 checkers()
@@ -58,21 +71,21 @@ void main()
     vec2 whole = floor(offset);
     ivec2 at = base + ivec2(whole);
     vec2 inside = offset - whole;
-    if (any(lessThan(at, ivec2(0))) || any(greaterThanEqual(at, size))) {
-        result = vec4(background, 1.0);
-        return;
-    }
-    float amount = share;
-    if (amount > 0.0) amount *= texture(coverage, (vec2(at) + inside) / covered_size).r;
-    vec4 color = vec4(0.0, 0.0, 0.0, 1.0);
-    if (amount < 1.0 || has_alpha) color = from_source(at, inside);
-    if (amount > 0.0) {
-        vec2 where = gl_FragCoord.xy / float(per_texel);
-        vec3 sum = per_texel == 1
-            ? texelFetch(field, ivec2(where), 0).rgb
-            : texture(field, where / vec2(textureSize(field, 0))).rgb;
-        color.rgb = mix(color.rgb, clamp(sum, 0.0, 1.0), amount);
-    }
+    bool outside = any(lessThan(at, ivec2(0))) || any(greaterThanEqual(at, size));
+#if defined(WITH_SOURCE)
+    vec4 color = from_source(at, inside);
+#if defined(WITH_FIELD)
+    color.rgb = mix(color.rgb, from_field(), share * texture(coverage, (vec2(at) + inside) / covered).r);
+#endif
     if (has_alpha) color.rgb = mix(checkers(), color.rgb, color.a);
-    result = vec4(color.rgb, 1.0);
+    vec3 shown = color.rgb;
+#else
+    vec3 shown = from_field();
+#endif
+    if (outside) shown = background;
+#ifdef WITH_OVERLAY
+    vec4 mark = texelFetch(overlay, ivec2(gl_FragCoord.xy), 0);
+    shown = mark.rgb + (1.0 - mark.a) * shown;
+#endif
+    result = vec4(shown, 1.0);
 }

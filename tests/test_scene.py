@@ -8,9 +8,10 @@ from viewer_scenarios import assert_shows, make_field
 
 from gsasr.rasterize.gl import pack, split_tiles
 from gsasr.view import View
+from viewer.coverage import BLOCK, EDGE
 from viewer.loading import split, to_rgba
 from viewer.painter import Painter
-from viewer.scene import BACKGROUND, BLOCK, EDGE, Overlay, Scene, Target
+from viewer.scene import BACKGROUND, Overlay, Scene, Target
 
 STEP = 1 / 255
 

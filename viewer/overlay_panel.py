@@ -21,7 +21,7 @@ def draw(session: Session) -> None:
     state = session.state
     if state.document is None or state.overlay == "none":
         return
-    hint = not session.painter.overlay_drawn
+    hint = not session.scene.overlay_drawn
     if state.overlay != "ellipses" and not hint:
         return
     viewport, em = imgui.get_main_viewport(), imgui.get_font_size()

@@ -8,7 +8,11 @@ where Gaussians have not arrived yet.
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import moderngl
 import numpy as np
@@ -16,12 +20,13 @@ import numpy as np
 from gsasr.files import shipped
 from gsasr.view import View
 
+from .coverage import Coverage
 from .state import Rectangle
 
+if TYPE_CHECKING:
+    from gsasr.rasterize.tiles import PackedTile
+
 FULL = 2.0  # scale from which only Gaussians are shown
-BLOCK = 4  # source pixels per texel of the coverage
-EDGE = 2  # blocks by which coverage keeps off tiles that have not arrived: further than they reach
-REACH = (EDGE + 2) * BLOCK  # source pixels beyond a tile that its arrival can change
 BACKGROUND = (0.085, 0.09, 0.1)  # beyond the picture, sRGB
 
 
@@ -37,6 +42,7 @@ class Target:
     """A framebuffer of RGBA8 pixels; row 0 is the top one."""
 
     def __init__(self, ctx: moderngl.Context, size: tuple[int, int]) -> None:
+        """size: (height, width), pixels."""
         self.size = size
         self.texture = ctx.texture((size[1], size[0]), 4)
         self.texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
@@ -53,6 +59,15 @@ class Target:
         self.texture.release()
 
 
+@dataclass
+class Seconds:
+    """What the parts of a drawing took; 0 for what was not drawn."""
+
+    field: float = 0.0
+    overlay: float = 0.0
+    picture: float = 0.0
+
+
 class Scene:
     """One picture and its tiles of Gaussians, in one OpenGL context."""
 
@@ -60,25 +75,23 @@ class Scene:
         self.ctx = ctx
         self.size = (0, 0)  # (height, width) of the picture, source pixels
         self.tiles: list = []
-        self.has_alpha = False
+        self.overlay_drawn = True  # False where Gaussians lie too close together on the screen
+        self._has_alpha = False
         self._rasterizer = None  # both need torch, which is not imported before the first tile
         self._overlays = None
         self._source: moderngl.Texture | None = None
-        self._coverage: moderngl.Texture | None = None
-        self._arrived = np.zeros((0, 0), bool)
+        self._coverage: Coverage | None = None
         self._field: moderngl.Texture | None = None
-        self._program = ctx.program(
-            vertex_shader=shipped("shaders/picture.vert").read_text(),
-            fragment_shader=shipped("shaders/picture.frag").read_text(),
-        )
-        self._triangle = ctx.vertex_array(self._program, [])
+        self._marks: Target | None = None
+        self._marks_of: tuple | None = None  # the view, overlay and tiles that they show
+        self._arrays: dict[tuple[bool, ...], moderngl.VertexArray] = {}
         self._pixel = Target(ctx, (1, 1))
 
     def set_picture(self, pixels: np.ndarray) -> None:
         """Show another picture, (H, W, 4) uint8 RGBA; drops all tiles."""
         self.clear()
         self.size = (pixels.shape[0], pixels.shape[1])
-        self.has_alpha = bool((pixels[..., 3] < 255).any())
+        self._has_alpha = bool((pixels[..., 3] < 255).any())
         limit = self.ctx.info["GL_MAX_TEXTURE_SIZE"]
         step = -(-max(self.size) // limit)  # beyond what the GPU can hold, every n-th pixel
         pixels = np.ascontiguousarray(pixels[::step, ::step])
@@ -86,29 +99,16 @@ class Scene:
         self._source.build_mipmaps()
         self._source.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
         self._source.repeat_x = self._source.repeat_y = False
-        blocks = tuple(-(-side // BLOCK) for side in self.size)
-        self._arrived = np.zeros(blocks, bool)
-        self._coverage = self.ctx.texture(
-            (blocks[1], blocks[0]), 1, bytes(blocks[0] * blocks[1]), alignment=1
-        )
-        self._coverage.repeat_x = self._coverage.repeat_y = False
+        self._coverage = Coverage(self.ctx, self.size)
 
     def clear(self) -> None:
         """Forget picture and tiles."""
         self.clear_tiles()
-        for texture in (self._source, self._coverage):
-            if texture is not None:
-                texture.release()
-        self._source = self._coverage = None
-        self.size = (0, 0)
-
-    def release(self) -> None:
-        """Free everything on the GPU; the scene cannot be used any more."""
-        self.clear()
-        self._pixel.release()
-        for held in (self._field, self._rasterizer, self._overlays, self._triangle, self._program):
+        for held in (self._source, self._coverage):
             if held is not None:
                 held.release()
+        self._source = self._coverage = None
+        self.size = (0, 0)
 
     def clear_tiles(self) -> None:
         """Forget the Gaussians, keep the picture."""
@@ -116,11 +116,10 @@ class Scene:
             tile.release()
         self.tiles = []
         if self._coverage is not None:
-            self._arrived[:] = False
-            self._coverage.write(bytes(self._arrived.size), alignment=1)
+            self._coverage.clear()
 
-    def add_tile(self, packed) -> None:
-        """Add a PackedTile of Gaussians; nothing of it shows before `cover`."""
+    def add_tile(self, packed: PackedTile) -> None:
+        """Add Gaussians; nothing of them shows before `cover`. Raises BackendError: no memory."""
         if self._rasterizer is None:
             from gsasr.rasterize.gl import GlRasterizer
 
@@ -130,23 +129,16 @@ class Scene:
 
     def cover(self, core: Rectangle) -> None:
         """All Gaussians of a rectangle have arrived: show them where its neighbours' have, too."""
-        rows, columns = self._arrived.shape
-        x0, y0, x1, y1 = (round(side / BLOCK) for side in core)
-        self._arrived[y0 : min(y1, rows), x0 : min(x1, columns)] = True
-        # Only blocks near the rectangle can have become complete.
-        left, top = max(0, x0 - EDGE), max(0, y0 - EDGE)
-        right, bottom = min(columns, x1 + EDGE), min(rows, y1 + EDGE)
-        if left >= right or top >= bottom:
-            return
-        around = np.pad(self._arrived, EDGE, constant_values=True)[
-            top : bottom + 2 * EDGE, left : right + 2 * EDGE
-        ]
-        complete = np.lib.stride_tricks.sliding_window_view(around, (2 * EDGE + 1,) * 2).all((2, 3))
-        self._coverage.write(
-            np.where(complete, 255, 0).astype(np.uint8).tobytes(),
-            viewport=(left, top, right - left, bottom - top),
-            alignment=1,
-        )
+        self._coverage.add(core)
+
+    def release(self) -> None:
+        """Free everything on the GPU; the scene cannot be used any more."""
+        self.clear()
+        programs = [array.program for array in self._arrays.values()]
+        held = (self._pixel, self._field, self._marks, self._rasterizer, self._overlays)
+        for each in (*held, *self._arrays.values(), *programs):
+            if each is not None:
+                each.release()
 
     def share(self, scale: float) -> float:
         """How much of what is seen at a scale is Gaussians, in [0, 1]."""
@@ -162,27 +154,27 @@ class Scene:
         overlay: Overlay,
         rows: tuple[int, int] | None = None,
         coarseness: int = 1,
-    ) -> bool:
+    ) -> Seconds:
         """Draw output rows [start, stop) of a view (default: all) into the target.
-
-        Returns whether there was an overlay to draw: close-lying Gaussians have none.
 
         coarseness: output pixels per computed sample of the Gaussians along each axis; the
             source, the overlay and the picture's edge are always drawn exactly.
+
+        An overlay is drawn whole, once, however many bands of rows then show it.
         """
-        start, stop = rows or (0, view.size[0])
-        framebuffer = target.framebuffer
-        framebuffer.scissor = (0, start, view.size[1], stop - start)
-        drawn = False
+        seconds = Seconds()
         if self._source is None:
-            framebuffer.use()
-            framebuffer.clear(*BACKGROUND, 1.0)
-        else:
-            self._draw_picture(framebuffer, view, start, stop, coarseness, self.has_alpha)
-            if overlay.kind != "none" and self.tiles:
-                drawn = self._draw_overlay(framebuffer, view, overlay)
-        framebuffer.scissor = None
-        return drawn
+            target.framebuffer.clear(*BACKGROUND, 1.0)
+            return seconds
+        start, stop = rows or (0, view.size[0])
+        marks = None
+        if overlay.kind != "none" and self.tiles:
+            with self._timed(seconds, "overlay"):
+                marks = self._overlay_texture(view, overlay)
+        target.framebuffer.scissor = (0, start, view.size[1], stop - start)
+        self._draw(target.framebuffer, view, (start, stop), coarseness, marks, seconds)
+        target.framebuffer.scissor = None
+        return seconds
 
     def color_at(self, view: View, x: int, y: int) -> tuple[int, int, int] | None:
         """8-bit RGB that the picture (no overlay, no checkerboard) has at an output pixel."""
@@ -192,54 +184,81 @@ class Scene:
         ):
             return None
         spot = View(view.to_source(x, y), view.scale, (1, 1))
-        self._draw_picture(self._pixel.framebuffer, spot, 0, 1, 1, False)
+        # A field texture of its own: the canvas' one would be made anew for every pixel asked.
+        field, self._field = self._field, None
+        self._draw(self._pixel.framebuffer, spot, (0, 1), 1, None, Seconds(), checkers=False)
+        if self._field is not None:
+            self._field.release()
+        self._field = field
         red, green, blue = self._pixel.read()[0, 0]
         return int(red), int(green), int(blue)
 
-    def _draw_picture(
+    def _draw(
         self,
         framebuffer: moderngl.Framebuffer,
         view: View,
-        start: int,
-        stop: int,
+        rows: tuple[int, int],
         coarseness: int,
-        has_alpha: bool,
+        marks: moderngl.Texture | None,
+        seconds: Seconds,
+        checkers: bool = True,
     ) -> None:
+        """The sum of the Gaussians, then the pass that puts all together."""
         share = self.share(min(view.scale))
         if share > 0:
-            size = tuple(-(-side // coarseness) for side in view.size)
-            scale = tuple(side / coarseness for side in view.scale)
-            band = (start // coarseness, -(-stop // coarseness))
-            field = self._field_texture(size)
-            self._rasterizer.draw(self.tiles, View(view.origin, scale, size), field, rows=band)
-            field.use(1)
+            with self._timed(seconds, "field"):
+                size = tuple(-(-side // coarseness) for side in view.size)
+                scale = tuple(side / coarseness for side in view.scale)
+                band = (rows[0] // coarseness, -(-rows[1] // coarseness))
+                field = self._field_texture(size)
+                self._rasterizer.draw(self.tiles, View(view.origin, scale, size), field, rows=band)
+                field.use(1)
+        has_alpha = self._has_alpha and checkers
+        with_source = share < 1 or has_alpha or not self._coverage.fills(view)
+        array = self._array(with_source, share > 0, min(view.scale) > 1, marks is not None)
         base = [math.floor(value) for value in view.origin]
-        program = self._program
-        program["base"] = base
-        program["fraction"] = [
-            value - whole for value, whole in zip(view.origin, base, strict=True)
-        ]
-        program["pixel"] = [1 / scale for scale in view.scale]
-        program["size"] = self.size[::-1]
-        program["per_texel"] = coarseness
-        program["share"] = share
-        program["covered_size"] = [side * BLOCK for side in self._arrived.shape[::-1]]
-        program["has_alpha"] = has_alpha
-        program["background"] = BACKGROUND
-        self._source.use(0)
-        self._coverage.use(2)
-        framebuffer.use()
-        self.ctx.disable(moderngl.BLEND)
-        self._triangle.render(vertices=3)
+        values = {
+            "base": base,
+            "fraction": [at - whole for at, whole in zip(view.origin, base, strict=True)],
+            "pixel": [1 / scale for scale in view.scale],
+            "size": self.size[::-1],
+            "per_texel": coarseness,
+            "share": share,
+            "covered": self._coverage.span,
+            "has_alpha": has_alpha,
+            "background": BACKGROUND,
+        }
+        for name, value in values.items():
+            if name in array.program:  # a program has only the uniforms that it needs
+                array.program[name] = value
+        with self._timed(seconds, "picture"):
+            self._source.use(0)
+            self._coverage.texture.use(2)
+            if marks is not None:
+                marks.use(3)
+            framebuffer.use()
+            self.ctx.disable(moderngl.BLEND)
+            array.render(vertices=3)
 
-    def _draw_overlay(
-        self, framebuffer: moderngl.Framebuffer, view: View, overlay: Overlay
-    ) -> bool:
+    def _overlay_texture(self, view: View, overlay: Overlay) -> moderngl.Texture:
+        """The overlay on nothing, alpha premultiplied; drawn only if it has changed."""
         if self._overlays is None:
             from .overlays import Overlays
 
             self._overlays = Overlays(self.ctx)
-        return self._overlays.draw(self.tiles, view, framebuffer, overlay.kind, overlay.sigma)
+        if self._marks is None or self._marks.size != view.size:
+            if self._marks is not None:
+                self._marks.release()
+            self._marks, self._marks_of = Target(self.ctx, view.size), None
+        wanted = (view, overlay, tuple(map(id, self.tiles)))
+        if wanted != self._marks_of:
+            target = self._marks.framebuffer
+            target.clear(0.0, 0.0, 0.0, 0.0)
+            self.overlay_drawn = self._overlays.draw(
+                self.tiles, view, target, overlay.kind, overlay.sigma
+            )
+            self._marks_of = wanted
+        return self._marks.texture
 
     def _field_texture(self, size: tuple[int, int]) -> moderngl.Texture:
         """A texture (h, w) for sums of Gaussians; kept while the size stays."""
@@ -250,3 +269,24 @@ class Scene:
             self._field.filter = (moderngl.LINEAR, moderngl.LINEAR)
             self._field.repeat_x = self._field.repeat_y = False
         return self._field
+
+    def _array(self, *needs: bool) -> moderngl.VertexArray:
+        """The program for what a view needs, compiled at its first use."""
+        if needs not in self._arrays:
+            names = ("WITH_SOURCE", "WITH_FIELD", "MAGNIFIED", "WITH_OVERLAY")
+            defines = [f"#define {name}" for name, need in zip(names, needs, strict=True) if need]
+            version, rest = shipped("shaders/picture.frag").read_text().split("\n", 1)
+            program = self.ctx.program(
+                vertex_shader=shipped("shaders/picture.vert").read_text(),
+                fragment_shader="\n".join([version, *defines, rest]),
+            )
+            self._arrays[needs] = self.ctx.vertex_array(program, [])
+        return self._arrays[needs]
+
+    @contextmanager
+    def _timed(self, seconds: Seconds, part: str) -> Iterator[None]:
+        """Add what the GPU takes for the block to one part of `seconds`."""
+        start = time.perf_counter()
+        yield
+        self.ctx.finish()
+        setattr(seconds, part, getattr(seconds, part) + time.perf_counter() - start)

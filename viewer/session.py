@@ -10,8 +10,9 @@ from gsasr.view import View
 
 from . import export, loading
 from .camera import Camera
+from .coverage import REACH
 from .painter import Painter
-from .scene import REACH, Overlay, Scene
+from .scene import Overlay, Scene
 from .state import CONDITION, OVERLAYS, SIGMA, Document, Message, Rectangle, State
 from .worker import Task, Worker
 

@@ -12,8 +12,9 @@ from gsasr import image
 from gsasr.errors import BackendError, RequestError
 
 from .camera import Camera
+from .coverage import REACH
 from .loading import Loader
-from .scene import REACH, Overlay, Scene, Target
+from .scene import Overlay, Scene, Target
 from .state import Document, Rectangle
 from .worker import Task
 

@@ -1,0 +1,69 @@
+"""Where all Gaussians have arrived, as a texture that fades at the border of what is there."""
+
+from __future__ import annotations
+
+import math
+
+import moderngl
+import numpy as np
+
+from gsasr.view import View
+
+from .state import Rectangle
+
+BLOCK = 4  # source pixels per texel
+EDGE = 2  # blocks kept off tiles that have not arrived: further than their Gaussians reach
+REACH = (EDGE + 2) * BLOCK  # source pixels beyond a tile that its arrival can change
+
+
+class Coverage:
+    """One texel per block of the picture: 1 where it and all blocks around have arrived."""
+
+    def __init__(self, ctx: moderngl.Context, size: tuple[int, int]) -> None:
+        """size: (height, width) of the picture, source pixels."""
+        rows, columns = (-(-side // BLOCK) for side in size)
+        self.span = (columns * BLOCK, rows * BLOCK)  # source pixels, (x, y)
+        self.texture = ctx.texture((columns, rows), 1, bytes(rows * columns), alignment=1)
+        self.texture.repeat_x = self.texture.repeat_y = False
+        self._arrived = np.zeros((rows, columns), bool)
+        self._complete = np.zeros((rows, columns), bool)
+
+    def add(self, core: Rectangle) -> None:
+        """All Gaussians of a rectangle (source pixels) have arrived."""
+        rows, columns = self._arrived.shape
+        x0, y0, x1, y1 = (round(side / BLOCK) for side in core)
+        self._arrived[y0 : min(y1, rows), x0 : min(x1, columns)] = True
+        # Only blocks near the rectangle can have become complete.
+        left, top = max(0, x0 - EDGE), max(0, y0 - EDGE)
+        right, bottom = min(columns, x1 + EDGE), min(rows, y1 + EDGE)
+        if left >= right or top >= bottom:
+            return
+        around = np.pad(self._arrived, EDGE, constant_values=True)[
+            top : bottom + 2 * EDGE, left : right + 2 * EDGE
+        ]
+        windows = np.lib.stride_tricks.sliding_window_view(around, (2 * EDGE + 1,) * 2)
+        complete = self._complete[top:bottom, left:right] = windows.all((2, 3))
+        self.texture.write(
+            np.where(complete, 255, 0).astype(np.uint8).tobytes(),
+            viewport=(left, top, right - left, bottom - top),
+            alignment=1,
+        )
+
+    def clear(self) -> None:
+        """Nothing has arrived."""
+        self._arrived[:] = self._complete[:] = False
+        self.texture.write(bytes(self._arrived.size), alignment=1)
+
+    def fills(self, view: View) -> bool:
+        """Is everything complete that a view shows of the picture?"""
+        rows, columns = self._complete.shape
+        x0, y0 = view.origin
+        x1, y1 = view.to_source(view.size[1], view.size[0])
+        left, top = (max(0, math.floor(side / BLOCK) - 1) for side in (x0, y0))
+        right = min(columns, math.floor(x1 / BLOCK) + 2)
+        bottom = min(rows, math.floor(y1 / BLOCK) + 2)
+        return bool(self._complete[top : max(top, bottom), left : max(left, right)].all())
+
+    def release(self) -> None:
+        """Free the texture."""
+        self.texture.release()

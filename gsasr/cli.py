@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from .errors import GsasrError, RequestError
+from .memory import require_picture
 
 BACKENDS = ("auto", "gl", "cpu", "cuda", "reference")
 
@@ -36,11 +37,14 @@ def upscale(options: argparse.Namespace) -> None:
     from . import image
     from .model import load_model
     from .picture import resample_alpha, upscale
+    from .rasterize import require_backend
     from .view import View
 
     image.check_output(options.output)
+    require_backend(options.backend)
     picture = image.read(options.input)
     view = View.at_scale(picture.size, options.scale)
+    require_picture(view.size)
     model = load_model(options.model)
     with progress("upscaling") as told:
         color = upscale(model, picture.color, view, options.condition, options.backend, told)
@@ -94,7 +98,8 @@ def evaluate(options: argparse.Namespace) -> None:
 
 
 def train(options: argparse.Namespace) -> None:
-    from .training import PRESETS, train
+    from .training.config import PRESETS
+    from .training.loop import train
 
     given = {
         name: getattr(options, name)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from .errors import RequestError
 
+MAX_SIDE = 2**31 - 1  # of the output, pixels
+
 
 def output_length(length: int, scale: float) -> int:
     """floor(scale * length), safe against products such as 2.3 * 10 = 22.999999999999996."""
@@ -38,6 +40,8 @@ class View:
             raise RequestError(f"The scale must be above 0, but is {min(self.scale):g}.")
         if min(self.size) < 0:
             raise RequestError(f"The output size must not be negative, but is {self.size}.")
+        if max(self.size) > MAX_SIDE:
+            raise RequestError(f"No side may exceed {MAX_SIDE} pixels; use a smaller scale.")
 
     @staticmethod
     def at_scale(image_size: tuple[int, int], scale: float) -> View:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib
 
-__all__ = ["BACKENDS", "available_backends", "render"]
+__all__ = ["BACKENDS", "available_backends", "render", "require_backend"]
 
 
 def __getattr__(name: str):

@@ -30,6 +30,7 @@ def render(
     quality = quality or ("gradient" if differentiable else "export")
     if quality not in QUALITIES:
         raise RequestError(f"Unknown quality {quality!r}; use one of {', '.join(QUALITIES)}.")
+    require_backend(backend)
     if backend == "auto":
         backend = "cpu" if differentiable else available_backends()[0]
     if backend == "reference":
@@ -40,15 +41,19 @@ def render(
         from . import cpu
 
         return cpu.render(gaussians, view, quality)
-    if backend == "gl":
-        from . import gl
+    from . import gl
 
-        if differentiable:
-            raise RequestError("The gl backend has no gradients; use backend='cpu'.")
-        return torch.from_numpy(gl.render(gaussians, view, quality))
+    if differentiable:
+        raise RequestError("The gl backend has no gradients; use backend='cpu'.")
+    return torch.from_numpy(gl.render(gaussians, view, quality))
+
+
+def require_backend(backend: str) -> None:
+    """Raise the error that `render` would raise for this name, without drawing."""
     if backend == "cuda":
         raise BackendError("The cuda backend is not written yet; use --backend cpu or gl.")
-    raise RequestError(f"Unknown backend {backend!r}; use auto, {', '.join(BACKENDS)}.")
+    if backend not in ("auto", *BACKENDS):
+        raise RequestError(f"Unknown backend {backend!r}; use auto, {', '.join(BACKENDS)}.")
 
 
 def available_backends() -> list[str]:

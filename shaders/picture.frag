@@ -13,7 +13,6 @@ uniform ivec2 base;  // the view's origin is base + fraction, source pixels: exa
 uniform vec2 fraction;
 uniform vec2 pixel;  // source pixels per output pixel
 uniform ivec2 size;  // of the picture, source pixels
-uniform int per_texel;  // output pixels per texel of the field, along each axis
 uniform float share;  // of the Gaussians, in [0, 1]; the rest is the source
 uniform vec2 covered;  // source pixels that the coverage texture spans
 uniform bool has_alpha;
@@ -50,14 +49,7 @@ vec4 from_source(ivec2 at, vec2 inside)
 }
 #endif
 
-vec3 from_field()
-{
-    vec2 where = gl_FragCoord.xy / float(per_texel);
-    return clamp(
-        per_texel == 1 ? texelFetch(field, ivec2(where), 0).rgb
-                       : texture(field, where / vec2(textureSize(field, 0))).rgb,
-        0.0, 1.0);
-}
+vec3 from_field() { return clamp(texelFetch(field, ivec2(gl_FragCoord.xy), 0).rgb, 0.0, 1.0); }
 
 vec3 checkers()
 {

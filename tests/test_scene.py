@@ -132,15 +132,12 @@ def test_rows_drawn_one_band_after_another_are_the_whole(scene):
     assert np.abs(target.read() / 255 - whole).max() <= 1.01 * STEP
 
 
-def test_coarse_drawing_is_close_with_an_exact_edge(scene):
-    field = make_field()
-    scene.set_picture(random_picture())
+def test_a_reduced_view_shows_the_same_share_of_gaussians(scene):
+    pixels, field = random_picture(), make_field()
+    scene.set_picture(pixels)
     add(scene, field)
-    view = View((-3, -2), (16.0, 16.0), (500, 700))
-    exact, coarse = show(scene, view), show(scene, view, coarseness=4)
-    assert 0 < np.abs(exact - coarse).mean() < 0.01
-    background = np.abs(exact - BACKGROUND).max(2) < STEP
-    assert np.array_equal(background, np.abs(coarse - BACKGROUND).max(2) < STEP)
+    reduced = View((0, 0), (0.75, 0.75), (22, 30))
+    assert_shows(show(scene, reduced, zoom=3.0).astype(np.float32), field, reduced, step=1)
 
 
 def test_transparent_pixels_show_a_checkerboard(scene):
@@ -176,10 +173,18 @@ def test_painter_sharpens_when_the_view_rests(scene, monkeypatch):
     monkeypatch.setattr(module, "BUDGET", 1e-5)  # a machine on which nothing is affordable
     view = View((-3, -2), (10.0, 10.0), (300, 400))
     assert painter.paint(view, Overlay())
-    for step in range(5):
+    for step in range(1, 6):
         view = View((-3 + step, -2), (10.0, 10.0), (300, 400))
         assert painter.paint(view, Overlay())
-        assert painter.coarseness > 1 and painter.busy
+        assert painter.reduction > 1 and painter.busy
+        (layer, exact) = painter.layers()
+        assert exact.y1 == 0
+        small = painter._small.read() / 255
+        view_of_it = View(
+            view.origin, tuple(s / painter.reduction for s in view.scale), small.shape[:2]
+        )
+        assert_shows(small.astype(np.float32), field, view_of_it)
+        assert layer.u1 * small.shape[1] * painter.reduction == pytest.approx(400)
     assert not painter.paint(view, Overlay())  # nothing changed, and it has not rested yet
     painter._changed -= 1.0
     monkeypatch.setattr(module, "BUDGET", 1e-3)
@@ -188,7 +193,7 @@ def test_painter_sharpens_when_the_view_rests(scene, monkeypatch):
         assert painter.paint(view, Overlay())
         count += 1
     assert count > 1  # not all at once
-    assert painter.coarseness == 1
+    assert painter.reduction == 1
     assert_shows((painter.target.read() / 255).astype(np.float32), field, view)
     assert not painter.paint(view, Overlay())
 

@@ -43,8 +43,15 @@ def draw(session: Session, bottom: float) -> None:
         session.state.color = None
     _read_color(session)
     session.scene.ctx.screen.use()  # what Dear ImGui draws into next
-    texture = imgui.ImTextureRef(session.painter.target.texture.glo)
-    imgui.get_window_draw_list().add_image(texture, corner, corner + size)
+    draw_list = imgui.get_window_draw_list()
+    for layer in session.painter.layers():
+        draw_list.add_image(
+            imgui.ImTextureRef(layer.texture.glo),
+            (corner.x, corner.y + layer.y0 / density.y),
+            (corner.x + size.x, corner.y + layer.y1 / density.y),
+            (0, layer.v0),
+            (layer.u1, layer.v1),
+        )
     if session.state.document is None and not session.worker.tasks:
         _hint(corner, size)
     imgui.end()

@@ -1,40 +1,55 @@
 """Keeps the canvas up to date without ever spending much more than a frame's budget on it.
 
-While the view moves, Gaussians are drawn as coarsely as the budget demands; once it rests, the
-canvas is redrawn exactly, some rows per frame. On a GPU that is fast enough both are one step.
+While the view moves it is drawn as small as the budget demands, and shown enlarged; once it
+rests, it is drawn exactly, some rows per frame. On a fast GPU every frame is exact.
 """
 
 from __future__ import annotations
 
 import math
 import time
+from dataclasses import dataclass
+
+import moderngl
 
 from gsasr.view import View
 
-from .scene import Overlay, Scene, Seconds, Target
+from .scene import Overlay, Scene, Target
 
 BUDGET = 0.014  # seconds of drawing per frame
 REST = 0.1  # seconds without a change of view after which the picture is made exact
-COARSENESS = (1, 2, 3, 4, 6, 8)
+REDUCTIONS = (1, 2, 3, 4, 6, 8)
 MIN_ROWS = 16
 NOTHING = Overlay()
 
 
+@dataclass(frozen=True)
+class Layer:
+    """A texture's rectangle from (0, v0) to (u1, v1), shown over canvas rows [y0, y1)."""
+
+    texture: moderngl.Texture
+    y0: float
+    y1: float
+    u1: float
+    v0: float
+    v1: float
+
+
 class Painter:
-    """Draws a scene into a texture of the canvas' size."""
+    """Draws a scene for a canvas."""
 
     def __init__(self, scene: Scene) -> None:
-        self.target: Target | None = None
+        self.target: Target | None = None  # exact where it is not to be done yet
         self.seconds = 0.0  # that the last drawing took
-        self.coarseness = 1  # of what is on screen now
+        self.reduction = 1  # canvas pixels per drawn pixel of what is not exact
         self._scene = scene
+        self._small: Target | None = None
         self._shown: tuple[View, Overlay] | None = None
-        self._todo = (0, 0)  # rows that are not exact yet
+        self._todo = (0, 0)  # rows of the target that are not exact yet
         self._changed = -math.inf  # when the view did
-        # What things cost, learned as they are drawn
-        self._sample = Average(2e-8)  # seconds per sample of the Gaussians
-        self._pixel = Average(2e-9)  # per pixel of the last pass
-        self._marks = Average(0.0)  # per overlay
+        # Learned: seconds per pixel, without and with Gaussians, and per overlay
+        self._rate = {False: Average(5e-9), True: Average(3e-8)}
+        self._marks = Average(0.0)
 
     def invalidate(self, rows: tuple[float, float] = (-math.inf, math.inf)) -> None:
         """Draw these output rows of the present view again: what they show has changed."""
@@ -55,13 +70,21 @@ class Painter:
         """Is there something left to draw?"""
         return self._todo[0] < self._todo[1]
 
+    def layers(self) -> list[Layer]:
+        """What to show, the lowest first."""
+        height, width = self.target.size
+        if self.reduction == 1:
+            return [Layer(self.target.texture, 0, height, 1, 0, 1)]
+        rows, columns = (side * self.reduction for side in self._small.size)
+        small = Layer(self._small.texture, 0, height, width / columns, 0, height / rows)
+        done = self._todo[0]
+        return [small, Layer(self.target.texture, 0, done, 1, 0, done / height)]
+
     def paint(self, view: View, overlay: Overlay) -> bool:
-        """Bring the texture closer to the view, within the budget; True if it changed."""
+        """Bring what is shown closer to the view, within the budget; True if it changed."""
         now = time.perf_counter()
         if self.target is None or self.target.size != view.size:
-            if self.target is not None:
-                self.target.release()
-            self.target = Target(self._scene.ctx, view.size)
+            self.target = self._resized(self.target, view.size)
             self._shown = None
         if self._shown != (view, overlay):
             if self._shown is not None and self._shown[0] != view:
@@ -75,47 +98,63 @@ class Painter:
         return False
 
     def _draw_all(self, view: View, overlay: Overlay, moving: bool) -> None:
-        """All rows at once, as well as the budget allows."""
+        """The whole view at once, as well as the budget allows."""
         # An overlay that takes longer than a frame comes when the view rests.
         if moving and self._marks.value > BUDGET:
             overlay = NOTHING
-        self.coarseness = self._affordable(view)
-        self._draw(view, overlay, (0, view.size[0]), self.coarseness)
-        exact = self.coarseness == 1 and overlay == self._shown[1]
+        self.reduction = self._affordable(view, overlay)
+        if self.reduction == 1:
+            self._draw(self.target, view, overlay, (0, view.size[0]))
+        else:
+            size = tuple(-(-side // self.reduction) for side in view.size)
+            scale = tuple(side / self.reduction for side in view.scale)
+            if self._small is None or self._small.size != size:
+                self._small = self._resized(self._small, size)
+                self._small.texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
+            small = View(view.origin, scale, size)
+            self._draw(self._small, small, overlay, (0, size[0]), min(view.scale))
+        exact = self.reduction == 1 and overlay == self._shown[1]
         self._todo = (0, 0) if exact else (0, view.size[0])
 
     def _sharpen(self, view: View, overlay: Overlay) -> None:
         """Some more rows, exactly."""
         start, stop = self._todo
-        row = view.size[1] * (self._pixel.value + self._gaussians(view) * self._sample.value)
-        end = min(stop, start + max(MIN_ROWS, int(BUDGET / row)))
-        self._draw(view, overlay, (start, end), 1)
+        rate = self._rate[self._scene.share(min(view.scale)) > 0].value
+        end = min(stop, start + max(MIN_ROWS, int(BUDGET / (rate * view.size[1]))))
+        self._draw(self.target, view, overlay, (start, end))
         self._todo = (end, stop) if end < stop else (0, 0)
         if not self.busy:
-            self.coarseness = 1
+            self.reduction = 1
 
-    def _gaussians(self, view: View) -> bool:
-        return self._scene.share(min(view.scale)) > 0
-
-    def _affordable(self, view: View) -> int:
-        if not self._gaussians(view):
-            return 1
+    def _affordable(self, view: View, overlay: Overlay) -> int:
         pixels = view.size[0] * view.size[1]
-        left = max(BUDGET / 2, BUDGET - pixels * self._pixel.value)
-        for coarseness in COARSENESS:
-            if self._sample.value * pixels / coarseness**2 <= left:
-                return coarseness
-        return COARSENESS[-1]
+        left = BUDGET if overlay == NOTHING else max(BUDGET / 2, BUDGET - self._marks.value)
+        rate = self._rate[self._scene.share(min(view.scale)) > 0].value
+        for reduction in REDUCTIONS:
+            if rate * pixels / reduction**2 <= left:
+                return reduction
+        return REDUCTIONS[-1]
 
-    def _draw(self, view: View, overlay: Overlay, rows: tuple[int, int], coarseness: int) -> None:
-        took: Seconds = self._scene.draw(self.target, view, overlay, rows, coarseness)
-        self.seconds = took.field + took.picture + took.overlay
+    def _draw(
+        self,
+        target: Target,
+        view: View,
+        overlay: Overlay,
+        rows: tuple[int, int],
+        zoom: float | None = None,
+    ) -> None:
+        zoom = zoom or min(view.scale)
+        took = self._scene.draw(target, view, overlay, rows, zoom)
+        self.seconds = took.picture + took.overlay
         pixels = (rows[1] - rows[0]) * view.size[1]
-        if took.field:
-            self._sample.learn(took.field * coarseness**2 / pixels)
-        self._pixel.learn(took.picture / pixels)
+        self._rate[self._scene.share(zoom) > 0].learn(took.picture / pixels)
         if overlay != NOTHING and rows[0] == 0:
             self._marks.learn(took.overlay)
+
+    def _resized(self, target: Target | None, size: tuple[int, int]) -> Target:
+        if target is not None:
+            target.release()
+        return Target(self._scene.ctx, size)
 
 
 class Average:

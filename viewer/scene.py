@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -46,6 +44,7 @@ class Target:
         self.size = size
         self.texture = ctx.texture((size[1], size[0]), 4)
         self.texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
+        self.texture.repeat_x = self.texture.repeat_y = False
         self.framebuffer = ctx.framebuffer([self.texture])
 
     def read(self) -> np.ndarray:
@@ -61,11 +60,10 @@ class Target:
 
 @dataclass
 class Seconds:
-    """What the parts of a drawing took; 0 for what was not drawn."""
+    """What a drawing took."""
 
-    field: float = 0.0
-    overlay: float = 0.0
     picture: float = 0.0
+    overlay: float = 0.0
 
 
 class Scene:
@@ -153,12 +151,12 @@ class Scene:
         view: View,
         overlay: Overlay,
         rows: tuple[int, int] | None = None,
-        coarseness: int = 1,
+        zoom: float | None = None,
     ) -> Seconds:
         """Draw output rows [start, stop) of a view (default: all) into the target.
 
-        coarseness: output pixels per computed sample of the Gaussians along each axis; the
-            source, the overlay and the picture's edge are always drawn exactly.
+        zoom: the scale that decides how much of the source is shown and how much of the
+            Gaussians, if it is another than the view's.
 
         An overlay is drawn whole, once, however many bands of rows then show it.
         """
@@ -167,12 +165,15 @@ class Scene:
             target.framebuffer.clear(*BACKGROUND, 1.0)
             return seconds
         start, stop = rows or (0, view.size[0])
+        share = self.share(zoom or min(view.scale))
         marks = None
         if overlay.kind != "none" and self.tiles:
-            with self._timed(seconds, "overlay"):
-                marks = self._overlay_texture(view, overlay)
+            start_time = time.perf_counter()
+            marks = self._overlay_texture(view, overlay)
+            self.ctx.finish()
+            seconds.overlay = time.perf_counter() - start_time
         target.framebuffer.scissor = (0, start, view.size[1], stop - start)
-        self._draw(target.framebuffer, view, (start, stop), coarseness, marks, seconds)
+        self._draw(target.framebuffer, view, (start, stop), share, marks, seconds)
         target.framebuffer.scissor = None
         return seconds
 
@@ -186,7 +187,8 @@ class Scene:
         spot = View(view.to_source(x, y), view.scale, (1, 1))
         # A field texture of its own: the canvas' one would be made anew for every pixel asked.
         field, self._field = self._field, None
-        self._draw(self._pixel.framebuffer, spot, (0, 1), 1, None, Seconds(), checkers=False)
+        share = self.share(min(view.scale))
+        self._draw(self._pixel.framebuffer, spot, (0, 1), share, None, Seconds(), checkers=False)
         if self._field is not None:
             self._field.release()
         self._field = field
@@ -198,21 +200,17 @@ class Scene:
         framebuffer: moderngl.Framebuffer,
         view: View,
         rows: tuple[int, int],
-        coarseness: int,
+        share: float,
         marks: moderngl.Texture | None,
         seconds: Seconds,
         checkers: bool = True,
     ) -> None:
         """The sum of the Gaussians, then the pass that puts all together."""
-        share = self.share(min(view.scale))
+        start = time.perf_counter()
         if share > 0:
-            with self._timed(seconds, "field"):
-                size = tuple(-(-side // coarseness) for side in view.size)
-                scale = tuple(side / coarseness for side in view.scale)
-                band = (rows[0] // coarseness, -(-rows[1] // coarseness))
-                field = self._field_texture(size)
-                self._rasterizer.draw(self.tiles, View(view.origin, scale, size), field, rows=band)
-                field.use(1)
+            field = self._field_texture(view.size)
+            self._rasterizer.draw(self.tiles, view, field, rows=rows)
+            field.use(1)
         has_alpha = self._has_alpha and checkers
         with_source = share < 1 or has_alpha or not self._coverage.fills(view)
         array = self._array(with_source, share > 0, min(view.scale) > 1, marks is not None)
@@ -222,7 +220,6 @@ class Scene:
             "fraction": [at - whole for at, whole in zip(view.origin, base, strict=True)],
             "pixel": [1 / scale for scale in view.scale],
             "size": self.size[::-1],
-            "per_texel": coarseness,
             "share": share,
             "covered": self._coverage.span,
             "has_alpha": has_alpha,
@@ -231,14 +228,15 @@ class Scene:
         for name, value in values.items():
             if name in array.program:  # a program has only the uniforms that it needs
                 array.program[name] = value
-        with self._timed(seconds, "picture"):
-            self._source.use(0)
-            self._coverage.texture.use(2)
-            if marks is not None:
-                marks.use(3)
-            framebuffer.use()
-            self.ctx.disable(moderngl.BLEND)
-            array.render(vertices=3)
+        self._source.use(0)
+        self._coverage.texture.use(2)
+        if marks is not None:
+            marks.use(3)
+        framebuffer.use()
+        self.ctx.disable(moderngl.BLEND)
+        array.render(vertices=3)
+        self.ctx.finish()
+        seconds.picture += time.perf_counter() - start
 
     def _overlay_texture(self, view: View, overlay: Overlay) -> moderngl.Texture:
         """The overlay on nothing, alpha premultiplied; drawn only if it has changed."""
@@ -266,8 +264,6 @@ class Scene:
             if self._field is not None:
                 self._field.release()
             self._field = self.ctx.texture((size[1], size[0]), 4, dtype="f2")
-            self._field.filter = (moderngl.LINEAR, moderngl.LINEAR)
-            self._field.repeat_x = self._field.repeat_y = False
         return self._field
 
     def _array(self, *needs: bool) -> moderngl.VertexArray:
@@ -282,11 +278,3 @@ class Scene:
             )
             self._arrays[needs] = self.ctx.vertex_array(program, [])
         return self._arrays[needs]
-
-    @contextmanager
-    def _timed(self, seconds: Seconds, part: str) -> Iterator[None]:
-        """Add what the GPU takes for the block to one part of `seconds`."""
-        start = time.perf_counter()
-        yield
-        self.ctx.finish()
-        setattr(seconds, part, getattr(seconds, part) + time.perf_counter() - start)

@@ -81,9 +81,9 @@ def _facts(session: Session) -> None:
         imgui.same_line(0, 1.5 * em)
     imgui.text_disabled(f"{1000 * state.frame_seconds:.1f} ms")
     imgui.set_item_tooltip("Time of the last drawing of the picture")
-    if session.painter.coarseness > 1:
+    if session.painter.reduction > 1:
         imgui.same_line(0, 0.6 * em)
-        imgui.text_disabled(f"1/{session.painter.coarseness}")
+        imgui.text_disabled(f"1/{session.painter.reduction}")
         imgui.set_item_tooltip("Resolution in motion; it sharpens at rest")
 
 

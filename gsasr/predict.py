@@ -18,7 +18,7 @@ from .gaussians import Gaussians
 from .model import GSASR, activate
 
 TILE = 192  # side of a core, source pixels, rounded to the network's multiple
-HALO = 24  # receptive field that still matters, rounded likewise
+HALO = 16  # rounded likewise; beyond it, what a tile does not see changes no 8-bit level
 BEYOND = 4  # source pixels past the right and bottom edge whose Gaussians still reach inside
 
 

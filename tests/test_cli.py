@@ -101,18 +101,11 @@ def test_every_kind_of_picture_comes_out_in_its_kind(run, tiny, tmp_path):
     modes = {"gray": "L", "alpha": "RGBA"}
     for name, original in pictures.items():
         original.save(tmp_path / "in.png")
-        code, _, said = run(
-            "upscale",
-            tmp_path / "in.png",
-            "-o",
-            tmp_path / "out.png",
-            "--scale",
-            2,
-            "--model",
-            tiny,
-        )
+        out = tmp_path / "out.png"
+        enlarge = ["upscale", tmp_path / "in.png", "-o", out, "--scale", 2, "--model", tiny]
+        code, _, said = run(*enlarge)
         assert (code, said) == (0, "")
-        made = Image.open(tmp_path / "out.png")
+        made = Image.open(out)
         assert made.mode == modes.get(name, "RGB"), name
         assert made.size == (2 * original.width, 2 * original.height), name
 

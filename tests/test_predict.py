@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from gsasr import image
 from gsasr.errors import Cancelled, RequestError
 from gsasr.model import activate, load_model
 from gsasr.picture import conditioning_scale, render, resample_alpha, upscale
@@ -21,10 +22,10 @@ def picture(height: int, width: int) -> np.ndarray:
 
 
 def test_a_picture_of_whole_windows_is_predicted_as_the_network_says(tiny_model):
-    image = picture(8, 12)
-    field = predict(tiny_model, image, 3.0)
+    photo = picture(8, 12)
+    field = predict(tiny_model, photo, 3.0)
     with torch.inference_mode():
-        raw = tiny_model(torch.from_numpy(image).permute(2, 0, 1)[None], 3.0)[0]
+        raw = tiny_model(torch.from_numpy(photo).permute(2, 0, 1)[None], 3.0)[0]
     expected = activate(raw, (8, 12))
     assert (field.size, field.model, field.scale) == ((8, 12), "tiny", 3.0)
     for name, tensor in expected.tensors().items():
@@ -55,26 +56,27 @@ def test_tiles_nearest_to_the_point_of_interest_come_first(tiny_model):
 
 @pytest.mark.parametrize("tile", [48, 64, 96])
 def test_tiled_prediction_shows_no_seams_with_the_shipped_model(images, tile):
-    from gsasr import image
-
     model = load_model("lite")
     photo = image.read(images / "cat.png").color[40:200, 60:220]
     view = View.at_scale(photo.shape[:2], 2)
     whole = render(predict(model, photo, 2.0, tile=1024), view=view, backend="cpu")
     tiled = render(predict(model, photo, 2.0, tile=tile), view=view, backend="cpu")
+    # At the picture's own edge the network's shifted windows wrap round to the other side, of
+    # whatever it is given; inside, a tile must not be seen at all.
     difference = np.abs(whole - tiled)
-    assert np.quantile(difference, 0.999) < 2 / 255
-    # Seams would show as a jump across tile borders that the whole prediction does not have.
-    jumps = np.abs(np.diff(tiled - whole, axis=1)).mean(axis=(0, 2))
+    assert np.quantile(difference, 0.999) < 4 / 255
+    assert np.quantile(difference[24:-24, 24:-24], 0.999) < 0.2 / 255
+    # A seam would be a jump across a tile border that the whole prediction does not have.
+    jumps = np.abs(np.diff(tiled - whole, axis=1))[24:-24].mean(axis=(0, 2))
     borders = np.arange(2 * tile, 2 * photo.shape[1] - 1, 2 * tile) - 1
-    assert jumps[borders].mean() < max(2e-3, 3 * np.median(jumps))
+    assert jumps[borders].mean() < 0.05 / 255
 
 
 def test_progress_reaches_the_end_and_cancel_stops_between_tiles(tiny_model):
-    image, shares = picture(40, 40), []
-    predict(tiny_model, image, 2.0, tile=16, progress=shares.append)
+    photo, shares = picture(40, 40), []
+    predict(tiny_model, photo, 2.0, tile=16, progress=shares.append)
     assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) == 9
-    tiles = predict_tiles(tiny_model, image, tile=16, cancelled=lambda: len(shares) > 10)
+    tiles = predict_tiles(tiny_model, photo, tile=16, cancelled=lambda: len(shares) > 10)
     next(tiles)
     shares += [0, 0]
     with pytest.raises(Cancelled):
@@ -82,21 +84,21 @@ def test_progress_reaches_the_end_and_cancel_stops_between_tiles(tiny_model):
 
 
 def test_what_cannot_be_predicted_is_refused(tiny_model):
-    for image, scale in (
+    for wrong, scale in (
         (np.zeros((4, 4)), 2.0),
         (np.zeros((0, 4, 3)), 2.0),
         (picture(4, 4), 0.0),
         (picture(4, 4), float("nan")),
     ):
         with pytest.raises(RequestError):
-            predict(tiny_model, image, scale)
+            predict(tiny_model, wrong, scale)
 
 
 def test_drawing_tile_by_tile_equals_drawing_the_whole_field(tiny_model):
-    image = picture(40, 52)
+    photo = picture(40, 52)
     for view in (View.at_scale((40, 52), 2.7), View((-3.0, 20.5), (3.0, 3.0), (90, 60))):
-        streamed = upscale(tiny_model, image, view, condition=2.0, backend="cpu")
-        oracle = reference.render(predict(tiny_model, image, 2.0), view).numpy()
+        streamed = upscale(tiny_model, photo, view, condition=2.0, backend="cpu")
+        oracle = reference.render(predict(tiny_model, photo, 2.0), view).numpy()
         assert np.abs(streamed - oracle).max() < 2e-4
 
 

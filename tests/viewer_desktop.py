@@ -61,7 +61,8 @@ def play(application) -> None:
     until(lambda: "Help" in session.state.dialogs)
     xdotool("key", "Escape")
     until(lambda: not session.state.dialogs)
-    xdotool("key", "ctrl+q")
+    xdotool("keydown", "ctrl", "key", "q", "keyup", "ctrl")  # as fingers do: Ctrl leaves last
+    until(lambda: session.quitting)
 
 
 def main(folder: Path) -> int:

@@ -21,6 +21,7 @@ from .scene import Scene
 from .session import Session
 
 TITLE = "GSASR"
+BUSY_FPS, IDLE_FPS = 10.0, 1.0  # without input; input is handled at once in any case
 RESULTS = 0.006  # seconds per frame for what the worker has sent
 WITHOUT = "render without a window by --snapshot OUT.png."
 
@@ -70,6 +71,9 @@ class App:
         self._set_title()
         if session.camera.moving or session.painter.busy:
             hello_imgui.request_refresh()
+        state = session.state
+        waiting = session.worker.tasks or state.message or state.dialogs
+        hello_imgui.get_runner_params().fps_idling.fps_idle = BUSY_FPS if waiting else IDLE_FPS
         if session.quitting:
             hello_imgui.get_runner_params().app_shall_exit = True
         self._frames += 1
@@ -115,7 +119,6 @@ def run(
         use_forward_compat=True,
         anti_aliasing_samples=0,
     )
-    params.fps_idling.fps_idle = 10.0
     params.fps_idling.time_active_after_last_event = 0.5
     params.ini_disable = True
     params.callbacks.setup_imgui_style = theme.apply

@@ -279,7 +279,7 @@ def export_the_view(ui: Ui, folder: Path) -> None:
     right, bottom = view.to_output(*field.size[::-1])
     assert left > 0 and right > view.size[1]  # the view cuts the picture
     part = np.s_[top : min(view.size[0], int(bottom)), left : min(view.size[1], int(right))]
-    assert written.shape == shown[part].shape
+    assert written.shape == shown[part].shape, (written.shape, shown[part].shape, view)
     assert np.abs(written - shown[part]).max() <= 1.01 / 255
     corner = View(view.to_source(left, top), view.scale, written.shape[:2])
     expected = oracle(field, every(corner, 5))
@@ -347,6 +347,44 @@ def cancel_prediction(ui: Ui, folder: Path) -> None:
     assert ui.pixels().std() > 0.05
 
 
+def a_picture_too_large_is_predicted_where_one_looks(ui: Ui, folder: Path) -> None:
+    from PIL import Image
+
+    from gsasr import image
+    from viewer import loading
+
+    path, target = folder / "wide.png", folder / "wide-view.png"
+    rng = np.random.default_rng(0)
+    Image.fromarray(rng.integers(0, 255, (40, 900, 3), dtype=np.uint8)).save(path)
+    before, loading.MOST = loading.MOST, 80_000
+    try:
+        ui.session.open(path)
+        ui.until(lambda: ui.session.state.document.path == path)
+        ui.rest()
+        document = ui.session.state.document
+        assert document.partial and not ui.session.ready
+        assert 0 < document.count <= 80_000
+        assert not ui.session.scene.covers(ui.view())
+        ui.on_window(lambda: ui.session.camera.look_at(870, 20, 16.0))
+        ui.until(lambda: ui.session.scene.covers(ui.view()))
+        ui.rest()
+        assert document.count <= 80_000
+        shown, view = ui.pixels(), ui.view()
+        # An export has all of them, and the same pixels.
+        ui.press("Ctrl+E")
+        ui.ctx.item_click("//###Export/Current view")
+        ui.ctx.item_input_value("//###Export/File", str(target))
+        ui.ctx.yield_()
+        ui.ctx.item_click("//###Export/Export")
+        ui.rest()
+        written = image.read(target).color
+        top, right = max(0, round(view.to_output(0, 0)[1])), written.shape[1]
+        part = shown[top : top + written.shape[0], :right]
+        assert np.abs(part - written).max() <= 1.51 / 255
+    finally:
+        loading.MOST = before
+
+
 def errors_are_shown(ui: Ui, folder: Path) -> None:
     field = open_field(ui, folder)
     damaged = folder / "damaged.png"
@@ -391,6 +429,7 @@ SCENARIOS = (
     export_errors_are_shown,
     open_another_by_drop,
     cancel_prediction,
+    a_picture_too_large_is_predicted_where_one_looks,
     errors_are_shown,
     typing_is_not_taken_for_keys,
 )

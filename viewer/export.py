@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
@@ -52,29 +53,27 @@ def to_size(region: View, size: tuple[int, int]) -> View:
     return View.of_region((*region.origin, width, height), size)
 
 
-def export(task: Task, document: Document, view: View, path: Path) -> None:
+def export(
+    task: Task,
+    document: Document,
+    view: View,
+    path: Path,
+    upscale: Callable[[Task, View], np.ndarray],
+) -> None:
     """Render the Gaussians through a view, exactly, and write them to a picture file.
+
+    upscale: makes the (h, w, 3) picture where not all Gaussians are in memory.
 
     The source's alpha, gray, depth and colour profile are kept where the format holds them.
     Raises GsasrError; a cancelled or failed export leaves no file.
     """
-    from gsasr import image, rasterize
-    from gsasr.gaussians import Gaussians
+    from gsasr import image
     from gsasr.memory import require_picture
 
     image.check_output(path)
     require_picture(view.size)
-    if not document.complete or not document.parts:
-        raise RequestError("Not all Gaussians are there; predict the whole picture first.")
     task.progress(0.0)
-    field = Gaussians.concatenate(document.parts)
-    color = np.empty((*view.size, 3), np.float32)
-    bounds = np.linspace(0, view.size[0], min(BANDS, view.size[0]) + 1).astype(int).tolist()
-    for start, stop in pairwise(bounds):
-        task.check()
-        band = rasterize.render(field, view.rows(start, stop), "cpu", "export")
-        color[start:stop] = band.numpy()
-        task.progress(stop / view.size[0])
+    color = _render(task, document, view) if document.complete else upscale(task, view)
     alpha = None
     if document.has_alpha:
         from gsasr.picture import resample_alpha
@@ -83,3 +82,19 @@ def export(task: Task, document: Document, view: View, path: Path) -> None:
     task.check()
     task.progress(None, f"Writing {path.name}")
     image.write(path, color, like=document.picture, alpha=alpha)
+
+
+def _render(task: Task, document: Document, view: View) -> np.ndarray:
+    """(h, w, 3) float32, band by band."""
+    from gsasr import rasterize
+    from gsasr.gaussians import Gaussians
+
+    field = Gaussians.concatenate(document.parts)
+    color = np.empty((*view.size, 3), np.float32)
+    bounds = np.linspace(0, view.size[0], min(BANDS, view.size[0]) + 1).astype(int).tolist()
+    for start, stop in pairwise(bounds):
+        task.check()
+        band = rasterize.render(field, view.rows(start, stop), "cpu", "export")
+        color[start:stop] = band.numpy()
+        task.progress(stop / view.size[0])
+    return color

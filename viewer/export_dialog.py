@@ -107,13 +107,10 @@ class ExportDialog:
             imgui.text(f"{width} × {height} pixels, {width * height / 1e6:.1f} megapixels")
         except GsasrError as error:
             imgui.text_colored(ERROR, str(error))
-        if not document.complete:
-            waiting = "Export begins when all Gaussians have arrived."
-            stopped = "Not all Gaussians are there; choose File > Predict again first."
-            imgui.text_disabled(waiting if session.worker.tasks else stopped)
+        if session.worker.tasks:
+            imgui.text_disabled("It begins when what is running has ended.")
         imgui.spacing()
-        possible = view is not None and (document.complete or bool(session.worker.tasks))
-        imgui.begin_disabled(not possible or not self._path.text.strip())
+        imgui.begin_disabled(view is None or not self._path.text.strip())
         if imgui.button("Export"):
             session.export(view, Path(self._path.text.strip()).expanduser())
             session.state.dialogs.discard(self.name)

@@ -129,6 +129,10 @@ class Scene:
         """All Gaussians of a rectangle have arrived: show them where its neighbours' have, too."""
         self._coverage.add(core)
 
+    def covers(self, view: View) -> bool:
+        """Are all Gaussians there of what a view shows of the picture?"""
+        return self._coverage is not None and self._coverage.fills(view)
+
     def release(self) -> None:
         """Free everything on the GPU; the scene cannot be used any more."""
         self.clear()

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numpy as np
+
 from gsasr.errors import GsasrError
 from gsasr.view import View
 
@@ -85,6 +87,16 @@ class Session:
 
         self.worker.post(f"Predicting {document.path.name}", work)
 
+    def follow(self) -> None:
+        """Of a picture too large to hold all Gaussians, have those that one looks at."""
+        document, camera = self.state.document, self.camera
+        if document is None or not document.partial or camera.moving or self.worker.tasks:
+            return
+        view = camera.view()
+        center = View(self._center(), view.scale, (1, 1))
+        if view.scale[0] > 1 and not self.scene.covers(center):
+            self.predict(self.state.condition)
+
     def save_field(self, path: Path) -> None:
         """Save the Gaussians to a file that opens without the network."""
         document = self.state.document
@@ -104,9 +116,13 @@ class Session:
     def export(self, view: View, path: Path) -> None:
         """Write the Gaussians through a view to a picture file."""
         document = self.state.document
+        model, condition = self.state.model, self.state.condition
+
+        def upscale(task: Task, view: View) -> np.ndarray:
+            return self._loader.upscale(task, document, model, condition, view)
 
         def work(task: Task) -> None:
-            export.export(task, document, view, path)
+            export.export(task, document, view, path, upscale)
             size = f"{view.size[1]}×{view.size[0]}"
             self.worker.show(task, lambda: self.note(f"Exported {size} pixels to {path}"))
 
@@ -224,4 +240,4 @@ class Session:
             self.painter.invalidate((top, bottom))
 
     def _complete(self, document: Document) -> None:
-        document.complete = True
+        document.complete = not document.partial

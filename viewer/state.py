@@ -26,7 +26,8 @@ class Document:
     pixels: (H, W, 4) uint8, RGBA, sRGB-encoded: the source as the screen shows it.
     picture: what was read from a picture file; None for a saved field.
     parts: the Gaussians that have arrived, one item per tile.
-    complete: whether all have arrived.
+    complete: whether all have arrived; partial: whether there are too many to hold, so that
+        only those around the view have.
     model, condition: what made them.
     """
 
@@ -35,6 +36,7 @@ class Document:
     picture: Picture | None = None
     parts: list[Gaussians] = field(default_factory=list)
     complete: bool = False
+    partial: bool = False
     model: str = ""
     condition: float = 0.0
 

@@ -95,9 +95,15 @@ class Worker:
                 task, action = self._results.get_nowait()
             except queue.Empty:
                 break
-            if task is None or not task.cancelled():
+            if task is not None and task.cancelled():
+                continue
+            ran = True
+            try:
                 action()
-                ran = True
+            except GsasrError as error:  # the GPU has no memory left, for one
+                if task is not None:
+                    task.cancel()
+                self._on_error(str(error))
         return ran
 
     def stop(self, seconds: float = 2.0) -> None:

@@ -275,8 +275,8 @@ def export_the_view(ui: Ui, folder: Path) -> None:
     written = image.read(target).color
     # Exactly the pixels of the canvas that lie on the picture
     view, shown = ui.view(), ui.pixels()
-    left, top = (max(0, round(np.ceil(side))) for side in view.to_output(0, 0))
-    right, bottom = view.to_output(*field.size[::-1])
+    left, top = (max(0, round(np.ceil(side.round(6)))) for side in np.array(view.to_output(0, 0)))
+    right, bottom = np.array(view.to_output(*field.size[::-1])).round(6)
     assert left > 0 and right > view.size[1]  # the view cuts the picture
     part = np.s_[top : min(view.size[0], int(bottom)), left : min(view.size[1], int(right))]
     assert written.shape == shown[part].shape, (written.shape, shown[part].shape, view)

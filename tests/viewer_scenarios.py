@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-SIZE = (760, 540)
+SIZE = (640, 460)
 
 
 class Ui:
@@ -147,7 +147,7 @@ def open_field(ui: Ui, folder: Path):
 def zoom_at_the_cursor(ui: Ui, folder: Path) -> None:
     field = open_field(ui, folder)
     assert_shows(ui.pixels(), field, ui.view())  # fitted: the edges are sharp
-    at = (420.0, 211.0)
+    at = (380.0, 171.0)
     ui.move(*at)
     held = ui.view().to_source(*at)
     worst = 0.0
@@ -209,7 +209,7 @@ def pan_fit_and_one_to_one(ui: Ui, folder: Path) -> None:
     ui.press("Right")
     ui.rest()
     assert ui.view().origin[0] > corner[0]
-    ui.move(380, 240)
+    ui.move(320, 200)
     ui.ctx.mouse_double_click()
     ui.rest()
     assert ui.view() == fitted
@@ -328,7 +328,7 @@ def cancel_prediction(ui: Ui, folder: Path) -> None:
 
     path = folder / "large.png"
     rng = np.random.default_rng(0)
-    Image.fromarray(rng.integers(0, 255, (1200, 1600, 3), dtype=np.uint8)).save(path)
+    Image.fromarray(rng.integers(0, 255, (900, 1200, 3), dtype=np.uint8)).save(path)
     ui.session.open(path)
     ui.until(lambda: ui.session.state.document is not None and ui.session.state.document.count > 0)
     assert ui.session.worker.tasks
@@ -338,9 +338,9 @@ def cancel_prediction(ui: Ui, folder: Path) -> None:
     assert ui.session.state.message is None
     count = ui.session.state.document.count
     ui.ctx.yield_(10)
-    assert ui.session.state.document.count == count < 1200 * 1600 * 4
+    assert ui.session.state.document.count == count < 900 * 1200 * 4
     # The picture can still be looked at, and what has arrived is drawn.
-    ui.move(380, 240)
+    ui.move(320, 200)
     for _ in range(12):
         ui.ctx.mouse_wheel_y(1.0)
     ui.rest()

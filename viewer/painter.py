@@ -16,7 +16,8 @@ from gsasr.view import View
 
 from .scene import Overlay, Scene, Target
 
-BUDGET = 0.014  # seconds of drawing per frame
+BUDGET = 0.014  # seconds of drawing per frame while the view moves
+PATIENCE = 2.0  # as much of it per frame at rest, when nobody waits for the next one
 REST = 0.1  # seconds without a change of view after which the picture is made exact
 REDUCTIONS = (1, 2, 3, 4, 6, 8)
 MIN_ROWS = 16
@@ -120,7 +121,7 @@ class Painter:
         """Some more rows, exactly."""
         start, stop = self._todo
         rate = self._rate[self._scene.share(min(view.scale)) > 0].value
-        end = min(stop, start + max(MIN_ROWS, int(BUDGET / (rate * view.size[1]))))
+        end = min(stop, start + max(MIN_ROWS, int(PATIENCE * BUDGET / (rate * view.size[1]))))
         self._draw(self.target, view, overlay, (start, end))
         self._todo = (end, stop) if end < stop else (0, 0)
         if not self.busy:

@@ -187,7 +187,7 @@ def test_painter_sharpens_when_the_view_rests(scene, monkeypatch):
         assert layer.u1 * small.shape[1] * painter.reduction == pytest.approx(400)
     assert not painter.paint(view, Overlay())  # nothing changed, and it has not rested yet
     painter._changed -= 1.0
-    monkeypatch.setattr(module, "BUDGET", 1e-3)
+    monkeypatch.setattr(module, "BUDGET", 1e-4)
     count = 0
     while painter.busy:
         assert painter.paint(view, Overlay())

@@ -23,7 +23,9 @@ def writing(path: str | os.PathLike, error: type[GsasrError]) -> Iterator[Path]:
     beside = path.with_name(f".{path.stem}-{secrets.token_hex(4)}{path.suffix}")
     try:
         beside.touch()
+        mode = beside.stat().st_mode  # some writers make the file anew, readable by its owner only
         yield beside
+        beside.chmod(mode)
         os.replace(beside, path)
     except OSError as failure:
         reason = failure.strerror or str(failure)

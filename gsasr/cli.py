@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import signal
 import sys
+import threading
 from collections.abc import Callable
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,19 +14,23 @@ from typing import NoReturn
 
 from .errors import GsasrError, RequestError
 from .memory import require_picture
-
-BACKENDS = ("auto", "gl", "cpu", "cuda", "reference")
+from .rasterize import BACKENDS
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns the exit code: 0 for success, 2 for a user's mistake."""
     options = parser().parse_args(arguments)
+    if threading.current_thread() is threading.main_thread():
+        # As for Ctrl+C: clean up behind a file that is being written.
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
         options.run(options)
     except GsasrError as error:
         print(f"gsasr: {error}", file=sys.stderr)
         return 2
-    except MemoryError:
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "allocate memory" not in str(error):
+            raise  # PyTorch's way of saying the same
         print("gsasr: Not enough memory; use a smaller scale or a region.", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -45,6 +51,7 @@ def upscale(options: argparse.Namespace) -> None:
     picture = image.read(options.input)
     view = View.at_scale(picture.size, options.scale)
     require_picture(view.size)
+    image.check_output(options.output, view.size, alpha=picture.alpha is not None)
     model = load_model(options.model)
     with progress("upscaling") as told:
         color = upscale(model, picture.color, view, options.condition, options.backend, told)
@@ -59,6 +66,8 @@ def predict(options: argparse.Namespace) -> None:
     from .model import load_model
     from .predict import predict
 
+    if options.output.suffix != ".safetensors":
+        raise FieldError(f"{options.output} must end in .safetensors.")
     check_writable(options.output, FieldError)
     picture = image.read(options.input)
     model = load_model(options.model)
@@ -75,7 +84,10 @@ def render(options: argparse.Namespace) -> None:
     image.check_output(options.output)
     field = Gaussians.load(options.input)
     view = chosen_view(field.size, options.scale, options.size, options.region)
-    image.write(options.output, render(field, view=view, backend=options.backend))
+    image.check_output(options.output, view.size)
+    with progress("rendering") as told:
+        color = render(field, view=view, backend=options.backend, progress=told)
+    image.write(options.output, color)
 
 
 def info(options: argparse.Namespace) -> None:
@@ -195,7 +207,9 @@ def parser() -> argparse.ArgumentParser:
         command.add_argument("--model", default="lite", help="preset name or .safetensors file")
 
     def add_backend(command: argparse.ArgumentParser) -> None:
-        command.add_argument("--backend", choices=BACKENDS, default="auto", help="rasterizer")
+        command.add_argument(
+            "--backend", choices=("auto", *BACKENDS, "cuda"), default="auto", help="rasterizer"
+        )
 
     def add_output(command: argparse.ArgumentParser, help: str) -> None:
         command.add_argument("-o", "--output", type=Path, required=True, help=help)

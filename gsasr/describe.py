@@ -7,6 +7,7 @@ from pathlib import Path
 
 from . import image
 from .errors import FieldError
+from .files import require_file
 from .gaussians import Gaussians
 
 
@@ -22,8 +23,7 @@ def describe(path: str | os.PathLike) -> dict[str, str]:
 def _is_field(path: str | os.PathLike) -> bool:
     from safetensors import SafetensorError, safe_open
 
-    if not Path(path).is_file():
-        raise FieldError(f"{path} does not exist or is no file; check the path.")
+    require_file(path, FieldError)
     try:
         with safe_open(path, framework="pt") as file:
             return "opacity" in file.keys()  # noqa: SIM118, the file is no mapping

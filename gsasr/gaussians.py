@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from .errors import FieldError
-from .files import writing
+from .files import require_file, writing
 
 TENSORS = {"mean": 2, "std": 2, "rho": 0, "color": 3, "opacity": 0}  # name -> columns, 0: flat
 
@@ -81,6 +81,8 @@ class Gaussians:
 
     def validate(self) -> Gaussians:
         """Itself, or FieldError if a value is not finite or outside its range."""
+        if min(self.size) < 1 or not math.isfinite(self.scale):
+            raise FieldError(f"The picture of a field cannot be {self.size[1]}x{self.size[0]}.")
         for name, tensor in self.tensors().items():
             if not bool(torch.isfinite(tensor).all()):
                 raise FieldError(
@@ -118,8 +120,7 @@ class Gaussians:
     @staticmethod
     def load(path: str | os.PathLike) -> Gaussians:
         """Read what `save` wrote. Raises FieldError for anything else, or for bad values."""
-        if not Path(path).is_file():
-            raise FieldError(f"{path} does not exist or is no file; check the path.")
+        require_file(path, FieldError)
         try:
             with safe_open(path, framework="pt") as file:
                 metadata = file.metadata() or {}
@@ -136,7 +137,14 @@ class Gaussians:
                     scale=float(metadata.get("scale", "0")),
                     source=metadata.get("source", ""),
                 ).validate()
-        except (SafetensorError, OSError, KeyError, ValueError) as error:
+        except (
+            SafetensorError,
+            OSError,
+            LookupError,
+            ValueError,
+            TypeError,
+            OverflowError,
+        ) as error:
             raise FieldError(
                 f"{path} is damaged or no file of Gaussians; predict the field anew."
             ) from error

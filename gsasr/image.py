@@ -16,7 +16,7 @@ import numpy as np
 from PIL import ExifTags, Image, ImageCms, UnidentifiedImageError
 
 from .errors import ImageError
-from .files import check_writable, writing
+from .files import check_writable, require_file, writing
 
 MAX_PIXELS = 256 * 1024**2  # a float32 picture of this size takes 3 GiB
 # Only decoders that work on the bytes alone: EPS, for one, would start Ghostscript.
@@ -59,19 +59,13 @@ def read(path: str | os.PathLike) -> Picture:
     Other metadata is dropped. Raises ImageError, in one sentence, for a path that cannot be read,
     a file that is damaged or no picture, and one of more than MAX_PIXELS pixels.
     """
-    path = Path(path)
-    if path.is_dir():
-        raise ImageError(f"{path} is a folder; give a picture in it.")
+    path = require_file(path, ImageError)
     try:
         with path.open("rb") as file:
             if not file.read(1):
                 raise ImageError(f"{path} is empty; save or download the picture again.")
             file.seek(0)
             return _decode(path, _open(path, file))
-    except FileNotFoundError as error:
-        raise ImageError(f"{path} does not exist; check the path.") from error
-    except PermissionError as error:
-        raise ImageError(f"{path} may not be read; check its permissions.") from error
     except OSError as error:
         raise ImageError(f"Cannot read {path}: {error.strerror or error}; copy it anew.") from error
 
@@ -96,19 +90,13 @@ def write(
     path = Path(path)
     form = _format(path)
     color, alpha = _checked(path, color, alpha)
-    if alpha is not None and not form.alpha:
-        raise ImageError(f"{form.name} holds no transparency; write {path.stem}.png instead.")
+    check_output(path, color.shape[:2], alpha is not None)
     if bits is None:
         bits = min(like.bits if like else 8, form.bits)
     if bits not in (8, 16):
         raise ImageError(f"A picture has 8 or 16 bits per channel, not {bits}.")
     if bits > form.bits:
         raise ImageError(f"{form.name} holds 8 bits per channel; write {path.stem}.png instead.")
-    if max(color.shape[:2]) > form.side:
-        raise ImageError(
-            f"{form.name} holds at most {form.side} pixels per side; write {path.stem}.png instead."
-        )
-
     gray = like is not None and like.gray and form.gray
     if gray and alpha is not None and bits == 16 and form.name == "TIFF":
         gray = False  # few readers, and not Pillow, know that variant
@@ -127,10 +115,22 @@ def write(
             Image.fromarray(flat).save(beside, form.name, icc_profile=icc, **form.options)
 
 
-def check_output(path: str | os.PathLike) -> None:
-    """Raise the ImageError now that `write` would raise after minutes of work: suffix, folder."""
-    _format(Path(path))
+def check_output(
+    path: str | os.PathLike, size: tuple[int, int] = (1, 1), alpha: bool = False
+) -> None:
+    """Raise the ImageError now that `write` would raise after minutes of work.
+
+    size: (height, width) of the picture to come; alpha: will it be transparent somewhere?
+    """
+    path = Path(path)
+    form = _format(path)
     check_writable(path, ImageError)
+    if alpha and not form.alpha:
+        raise ImageError(f"{form.name} holds no transparency; write {path.stem}.png instead.")
+    if max(size) > form.side:
+        raise ImageError(
+            f"{form.name} holds at most {form.side} pixels per side; write {path.stem}.png instead."
+        )
 
 
 # Reading
@@ -168,7 +168,7 @@ def _decode(path: Path, image: Image.Image) -> Picture:
         icc = image.info.get("icc_profile") or None
         pixels = _pixels16(path, image) if _is_16_bit(image) else _pixels8(path, image, icc)
         pixels = _upright(pixels, image.getexif().get(ExifTags.Base.Orientation, 1))
-    except ImageError:
+    except (ImageError, MemoryError):
         raise
     except Exception as error:  # as above
         raise ImageError(f"{path} is truncated or damaged; save or download it again.") from error
@@ -304,7 +304,7 @@ class _Format:
     options: dict
 
 
-_JPEG = _Format("JPEG", 8, False, True, 65535, {"quality": 95, "subsampling": "4:4:4"})
+_JPEG = _Format("JPEG", 8, False, True, 65500, {"quality": 95, "subsampling": "4:4:4"})
 _TIFF = _Format("TIFF", 16, True, True, np.inf, {"compression": "tiff_adobe_deflate"})
 _FORMATS = {
     ".png": _Format("PNG", 16, True, True, np.inf, {}),

@@ -23,9 +23,18 @@ def available() -> int:
 
 def require_picture(size: tuple[int, int]) -> None:
     """RequestError unless a picture of `size` (height, width) can be rendered and written."""
-    needed = size[0] * size[1] * 40  # float32 RGB, the clipped copy, and the bytes to write
+    # float32 RGBA, the clipped copy, and the bytes to write
+    _require(size[0] * size[1] * 48, f"A {size[1]}x{size[0]} picture")
+
+
+def require_field(count: int) -> None:
+    """RequestError unless `count` Gaussians can be held, as tiles and then as one."""
+    _require(count * 2 * 36, f"A field of {count:,} Gaussians")
+
+
+def _require(needed: int, what: str) -> None:
     if needed > available():
         raise RequestError(
-            f"A {size[1]}x{size[0]} picture needs {needed / 2**30:.1f} GiB, "
-            f"but {available() / 2**30:.1f} GiB are free; use a smaller scale or a region."
+            f"{what} needs {needed / 2**30:.1f} GiB, but {available() / 2**30:.1f} GiB are free; "
+            "use a smaller scale, region or picture."
         )

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
+import torch
 from PIL import Image
 
 from . import rasterize
-from .errors import RequestError
+from .errors import Cancelled, RequestError
 from .gaussians import Gaussians
 from .memory import require_picture
 from .model import GSASR
 from .predict import predict_tiles
 from .rasterize import footprint
+from .rasterize.tiles import split_tiles
 from .view import View
 
 TRAINED_SCALES = (1.0, 4.0)  # target scales that the networks saw in training
@@ -25,11 +27,14 @@ def render(
     size: tuple[int, int] | None = None,
     view: View | None = None,
     backend: str = "auto",
+    progress: Callable[[float], None] = lambda share: None,
+    cancelled: Callable[[], bool] = lambda: False,
 ) -> np.ndarray:
     """(h, w, 3) float32 picture of a field, sRGB, not clamped, within 1e-4 of the exact sum.
 
     Exactly one of: scale (floor(scale * side) pixels), size (height, width) of the whole
-    picture, or view. backend: see rasterize.render. Raises RequestError, BackendError.
+    picture, or view. backend: see rasterize.render. progress: told the share done in (0, 1].
+    cancelled: asked now and then; Cancelled is raised if true. Raises RequestError, BackendError.
     """
     if sum(choice is not None for choice in (scale, size, view)) != 1:
         raise RequestError("Give exactly one of scale, size and view.")
@@ -37,8 +42,12 @@ def render(
         view = View.at_scale(field.size, scale)
     elif size is not None:
         view = View.to_size(field.size, size)
-    require_picture(view.size)
-    return rasterize.render(field, view, backend, "export").detach().numpy()
+    if backend == "auto":
+        backend = rasterize.default_backend()
+    # The GPU draws all at once; elsewhere tile by tile, so that progress can be told.
+    tiles = split_tiles(field) if backend == "cpu" else [field]
+    parts = ((tile, number / len(tiles)) for number, tile in enumerate(tiles, start=1))
+    return _sum_of(parts, view, backend, progress, cancelled)
 
 
 def upscale(
@@ -57,14 +66,29 @@ def upscale(
     network; by default the view's, within what networks are trained for. progress: told the
     share done in (0, 1].
     """
-    require_picture(view.size)
     if condition is None:
         condition = conditioning_scale(max(view.scale))
+    parts = predict_tiles(model, image, condition, cancelled=cancelled)
+    return _sum_of(parts, view, backend, progress, cancelled)
+
+
+def _sum_of(
+    parts: Iterable[tuple[Gaussians, float]],
+    view: View,
+    backend: str,
+    progress: Callable[[float], None],
+    cancelled: Callable[[], bool],
+) -> np.ndarray:
+    """The picture that all parts, each with the share done after it, add up to."""
+    require_picture(view.size)
     picture = np.zeros((*view.size, 3), np.float32)
-    for part, share in predict_tiles(model, image, condition, cancelled=cancelled):
+    for part, share in parts:
+        if cancelled():
+            raise Cancelled("Rendering was cancelled.")
         rows, columns, window = _window(part, view)
         if window is not None:
-            drawn = rasterize.render(part, window, backend, "export")
+            with torch.no_grad():
+                drawn = rasterize.render(part, window, backend, "export")
             picture[rows, columns] += drawn.numpy()
         progress(share)
     return picture
@@ -78,11 +102,17 @@ def resample_alpha(alpha: np.ndarray, view: View) -> np.ndarray:
     height, width = alpha.shape
     x0, y0 = view.origin
     x1, y1 = view.to_source(view.size[1], view.size[0])
+    # A whole picture's edge may be missed by a rounding error, which is not beyond it.
     left, top, right, bottom = (
-        max(0, int(np.ceil(beyond))) for beyond in (-x0, -y0, x1 - width, y1 - height)
+        max(0, int(np.ceil(round(beyond, 6)))) for beyond in (-x0, -y0, x1 - width, y1 - height)
     )
     padded = Image.fromarray(np.pad(alpha, ((top, bottom), (left, right))).astype(np.float32))
-    box = (x0 + left, y0 + top, min(x1 + left, padded.width), min(y1 + top, padded.height))
+    box = (
+        max(0.0, x0 + left),
+        max(0.0, y0 + top),
+        min(x1 + left, padded.width),
+        min(y1 + top, padded.height),
+    )
     resized = padded.resize((view.size[1], view.size[0]), Image.Resampling.BICUBIC, box)
     return np.clip(np.asarray(resized), 0, 1)
 

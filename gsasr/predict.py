@@ -1,8 +1,10 @@
 """A picture of any size -> Gaussians, tile by tile.
 
 Shifted windows wrap around the edge of whatever the network is given, and convolutions see zeros
-there, so a tile is predicted with a halo; of the result it keeps the Gaussians whose reference
-position lies in its core. Cores partition the picture, so the union is one seamless field.
+there, so a tile is predicted with a halo, at the picture's own edge as anywhere: there the picture
+goes on as its reflection. Of the result a tile keeps the Gaussians whose reference position lies
+in its core; cores partition the picture, so the union is one seamless field. Outer tiles also
+keep those a little beyond the edge, which reach inside.
 """
 
 from __future__ import annotations
@@ -15,11 +17,13 @@ import torch
 
 from .errors import Cancelled, RequestError
 from .gaussians import Gaussians
+from .memory import require_field
 from .model import GSASR, activate
 
 TILE = 192  # side of a core, source pixels, rounded to the network's multiple
 HALO = 16  # rounded likewise; beyond it, what a tile does not see changes no 8-bit level
-BEYOND = 4  # source pixels past the right and bottom edge whose Gaussians still reach inside
+BEYOND = 4  # source pixels past the picture's edge whose Gaussians still reach inside
+SCALES = (0.1, 1000.0)  # conditioning scales that a network can be told
 
 
 @dataclass(frozen=True)
@@ -63,17 +67,14 @@ def predict_tile(model: GSASR, image: np.ndarray, tile: Tile, scale: float = 4.0
     height, width = image.shape[:2]
     multiple = model.multiple
     halo = _padded(HALO, multiple)
-    x0, y0 = max(0, tile.x0 - halo), max(0, tile.y0 - halo)
-    x1 = min(_padded(width, multiple), tile.x1 + halo)
-    y1 = min(_padded(height, multiple), tile.y1 + halo)
-    # Reflection at the right and bottom edge, as often as a tiny picture needs it.
+    x0, y0, x1, y1 = tile.x0 - halo, tile.y0 - halo, tile.x1 + halo, tile.y1 + halo
     crop = image[_reflected(y0, y1, height)][:, _reflected(x0, x1, width)]
     lr = torch.from_numpy(np.ascontiguousarray(crop, np.float32)).permute(2, 0, 1)[None]
     raw = model(lr, scale)[0]
     local = activate(raw, (y1 - y0, x1 - x0))
     per_pixel = model.config.decoder.seeds * int(np.prod(model.config.decoder.shuffle)) / multiple
-    inside_x = _core(x0, x1, tile.x0, min(tile.x1, width + BEYOND), per_pixel)
-    inside_y = _core(y0, y1, tile.y0, min(tile.y1, height + BEYOND), per_pixel)
+    inside_x = _core(x0, x1, tile.x0, tile.x1, width, per_pixel)
+    inside_y = _core(y0, y1, tile.y0, tile.y1, height, per_pixel)
     kept = local[(inside_y[:, None] & inside_x[None, :]).flatten()]
     return replace(
         kept,
@@ -117,6 +118,7 @@ def predict(
     image: (H, W, 3) float32 in [0, 1], sRGB; any size from 1x1. scale: conditioning scale, > 0.
     progress: told the share done after each tile. Raises RequestError for other input.
     """
+    require_field(round(image.shape[0] * image.shape[1] * model.config.decoder.gaussians_per_pixel))
     parts = []
     for part, share in predict_tiles(model, image, scale, tile, cancelled=cancelled):
         parts.append(part)
@@ -128,8 +130,12 @@ def check(image: np.ndarray, scale: float) -> None:
     """RequestError unless `image` and `scale` can be predicted from."""
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise RequestError(f"The picture must have shape (H, W, 3), but has {image.shape}.")
-    if not np.isfinite(scale) or scale <= 0:
-        raise RequestError(f"The conditioning scale must be above 0, but is {scale:g}.")
+    if not np.issubdtype(image.dtype, np.floating) or not np.isfinite(image).all():
+        raise RequestError("The picture must hold finite floating-point numbers in [0, 1].")
+    if not SCALES[0] <= scale <= SCALES[1]:
+        raise RequestError(
+            f"The conditioning scale must lie in {SCALES[0]:g}..{SCALES[1]:g}, but is {scale:g}."
+        )
 
 
 def _padded(length: int, multiple: int) -> int:
@@ -144,7 +150,14 @@ def _reflected(start: int, stop: int, length: int) -> np.ndarray:
     return np.minimum(index, 2 * length - 2 - index)
 
 
-def _core(start: int, stop: int, low: int, high: int, per_pixel: float) -> torch.Tensor:
-    """Mask over the fine-grid cells of [start, stop) whose centres lie in [low, high)."""
+def _core(
+    start: int, stop: int, low: int, high: int, length: int, per_pixel: float
+) -> torch.Tensor:
+    """Mask over the fine-grid cells of [start, stop): those of the core [low, high).
+
+    A core at an end of the picture [0, length) goes on beyond it.
+    """
+    low = -BEYOND if low == 0 else low
+    high = length + BEYOND if high >= length else high
     cells = start + (torch.arange(round((stop - start) * per_pixel)) + 0.5) / per_pixel
     return (cells >= low) & (cells < high)

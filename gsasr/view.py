@@ -12,7 +12,7 @@ MAX_SIDE = 2**31 - 1  # of the output, pixels
 
 def output_length(length: int, scale: float) -> int:
     """floor(scale * length), safe against products such as 2.3 * 10 = 22.999999999999996."""
-    return math.floor(round(scale * length, 6))
+    return math.floor(round(min(scale * length, MAX_SIDE + 1.0), 6))
 
 
 @dataclass(frozen=True)

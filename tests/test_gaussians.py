@@ -67,7 +67,7 @@ def test_files_that_hold_no_field_are_refused(tmp_path):
         (cut, "damaged"),
         (tmp_path / "empty.safetensors", "damaged"),
         (tmp_path / "missing.safetensors", "does not exist"),
-        (tmp_path, "is no file"),
+        (tmp_path, "is a folder"),
     ):
         with pytest.raises(FieldError, match=words):
             Gaussians.load(path)
@@ -79,3 +79,21 @@ def test_a_failed_save_leaves_nothing_behind(tmp_path):
     with pytest.raises(FieldError, match="is a folder"):
         random_field(3, (4, 4)).save(tmp_path)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_with_an_impossible_size_is_refused(tmp_path):
+    for size in ("5", "[Infinity, 2]", "[0, 0]", "[-1, 4]", "{}"):
+        field = random_field(3, (4, 4))
+        metadata = {"format": "gsasr-gaussians", "size": size}
+        save_file(field.tensors(), tmp_path / "f.safetensors", metadata)
+        with pytest.raises(FieldError):
+            Gaussians.load(tmp_path / "f.safetensors")
+
+
+def test_writing_goes_through_a_link_and_keeps_the_usual_permissions(tmp_path):
+    (tmp_path / "plain").touch()
+    (tmp_path / "link.safetensors").symlink_to(tmp_path / "real.safetensors")
+    random_field(3, (4, 4)).save(tmp_path / "link.safetensors")
+    assert (tmp_path / "link.safetensors").is_symlink()
+    written = (tmp_path / "real.safetensors").stat()
+    assert written.st_mode == (tmp_path / "plain").stat().st_mode and written.st_size > 0

@@ -205,3 +205,18 @@ def test_unknown_backends_and_qualities_are_refused():
         render(field, view, backend="metal")
     with pytest.raises(RequestError, match="Unknown quality 'best'"):
         render(field, view, quality="best")
+
+
+@pytest.mark.parametrize("quality", TOLERANCES)
+def test_many_tiny_gaussians_at_one_place_stay_within_the_tolerance(quality):
+    field = random_field(1000, (1, 1), seed=5).map(lambda tensor: tensor.clone())
+    field.mean[:], field.std[:], field.rho[:] = 0.5, 0.1, 0.0
+    field.opacity[:], field.color[:] = 1e-3, 1.0
+    view = View.at_scale((1, 1), 40)
+    difference = largest_difference(cpu.render(field, view, quality), reference.render(field, view))
+    assert difference < TOLERANCES[quality]
+
+
+def test_an_enormous_gaussian_is_drawn():
+    field = one((0.5, 0.5), (1e18, 1e18), opacity=0.5)
+    assert cpu.render(field, View.at_scale((1, 1), 3)).mean() == pytest.approx(0.5)

@@ -115,7 +115,15 @@ def test_the_paper_preset_states_the_papers_schedule():
 
 
 def test_impossible_settings_are_refused():
-    for wrong in ({"scale_min": 0.5}, {"batch": 0}, {"precision": "int8"}):
+    for wrong in (
+        {"scale_min": 0.5},
+        {"batch": 0},
+        {"precision": "int8"},
+        {"betas": (0.9,)},
+        {"ema": 7.0},
+        {"seed": -1},
+        {"rate": float("nan")},
+    ):
         with pytest.raises(RequestError):
             TrainConfig(**wrong)
 
@@ -170,3 +178,30 @@ def test_a_kill_loses_only_the_steps_since_the_last_save(pictures, tmp_path):
     done = subprocess.run([*command, "--steps", str(state + 2)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert torch.load(run / "state.pt", weights_only=True)["step"] == state + 2
+
+
+def test_a_diverging_run_stops_and_keeps_what_was_saved(pictures, tmp_path, small_preset):
+    run = tmp_path / "run"
+    path = train("lite", pictures, run, replace(QUICK, steps=2))
+    saved = path.read_bytes()
+    with pytest.raises(DataError, match="diverged at step"):
+        train("lite", pictures, run, replace(QUICK, steps=40, rate=1e30, clip=0.0))
+    assert path.read_bytes() == saved or load_model(path)
+
+
+def test_a_run_killed_between_its_last_two_files_is_completed(pictures, tmp_path, small_preset):
+    path = train("lite", pictures, tmp_path / "run", QUICK)
+    path.unlink()
+    (tmp_path / "run" / ".state-1234.pt").write_bytes(b"half")
+    assert load_model(train("lite", pictures, tmp_path / "run", QUICK)).config.decoder.window == 4
+    assert sorted(p.name for p in (tmp_path / "run").iterdir()) == [
+        "log.csv",
+        "model.safetensors",
+        "state.pt",
+    ]
+
+
+def test_a_patch_that_does_not_fit_the_windows_is_refused_at_once(pictures, tmp_path):
+    with pytest.raises(RequestError, match="multiple of 8"):
+        train("lite", pictures, tmp_path / "run", replace(QUICK, patch=33))
+    assert not (tmp_path / "run").exists()

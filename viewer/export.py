@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +13,6 @@ from gsasr.view import View, output_length
 
 from .state import Document
 from .worker import Task
-
-BANDS = 24  # steps of progress; cancelling waits for one
 
 
 def region_of(view: View, size: tuple[int, int]) -> View:
@@ -50,7 +47,7 @@ def to_size(region: View, size: tuple[int, int]) -> View:
     height, width = (
         side / scale for side, scale in zip(region.size, region.scale[::-1], strict=True)
     )
-    return View.of_region((*region.origin, width, height), size)
+    return View.region_to_size((*region.origin, width, height), size)
 
 
 def export(
@@ -70,10 +67,19 @@ def export(
     from gsasr import image
     from gsasr.memory import require_picture
 
-    image.check_output(path)
+    image.check_output(path, view.size, document.has_alpha)
     require_picture(view.size)
     task.progress(0.0)
-    color = _render(task, document, view) if document.complete else upscale(task, view)
+    if document.complete:
+        from gsasr.gaussians import Gaussians
+        from gsasr.picture import render
+
+        field = Gaussians.concatenate(document.parts)
+        color = render(
+            field, view=view, backend="cpu", progress=task.progress, cancelled=task.cancelled
+        )
+    else:
+        color = upscale(task, view)
     alpha = None
     if document.has_alpha:
         from gsasr.picture import resample_alpha
@@ -82,19 +88,3 @@ def export(
     task.check()
     task.progress(None, f"Writing {path.name}")
     image.write(path, color, like=document.picture, alpha=alpha)
-
-
-def _render(task: Task, document: Document, view: View) -> np.ndarray:
-    """(h, w, 3) float32, band by band."""
-    from gsasr import rasterize
-    from gsasr.gaussians import Gaussians
-
-    field = Gaussians.concatenate(document.parts)
-    color = np.empty((*view.size, 3), np.float32)
-    bounds = np.linspace(0, view.size[0], min(BANDS, view.size[0]) + 1).astype(int).tolist()
-    for start, stop in pairwise(bounds):
-        task.check()
-        band = rasterize.render(field, view.rows(start, stop), "cpu", "export")
-        color[start:stop] = band.numpy()
-        task.progress(stop / view.size[0])
-    return color

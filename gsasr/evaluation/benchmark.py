@@ -50,6 +50,8 @@ def benchmark(
             lr = image.read(folder / f"LR/x{scale}" / name).color
             height, width = lr.shape[0] * scale, lr.shape[1] * scale
             truth = image.read(folder / "HR" / name).color[:height, :width]
+            if truth.shape[:2] != (height, width) or min(height, width) < 11 + 2 * scale:
+                raise DataError(f"HR/{name} in {folder} does not fit its LR/x{scale} picture.")
             picture = upscale(model, lr, View.at_scale(lr.shape[:2], scale), backend=backend)
             scores.append(
                 Score(name, scale, psnr_y(picture, truth, scale), ssim_y(picture, truth, scale))

@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from ..errors import CheckpointError
-from ..files import shipped, writing
+from ..files import require_file, shipped, writing
 from .decoder import GaussianDecoder
 from .encoders import EDSR
 from .network import GSASR, ModelConfig
@@ -36,13 +36,14 @@ def load_model(name: str | os.PathLike = "lite") -> GSASR:
             f"No trained weights of {name} are shipped; give a .safetensors file of it."
         )
     path = Path(name)
-    if not path.is_file():
+    if path.suffix != ".safetensors":
         known = ", ".join(SHIPPED)
         raise CheckpointError(f"There is no model {name}; give a .safetensors file or {known}.")
     return _load_file(path, path.stem)
 
 
 def _load_file(path: Path, name: str) -> GSASR:
+    require_file(path, CheckpointError)
     parts: dict[str, dict[str, torch.Tensor]] = {"encoder": {}, "decoder": {}}
     try:
         with safe_open(path, framework="pt") as file:
@@ -64,6 +65,8 @@ def build(
     """
     try:
         config = ModelConfig(EDSR.config_from(encoder), GaussianDecoder.config_from(decoder))
+        if config.decoder.channels % config.decoder.heads:
+            raise ValueError("heads must divide channels")
         model = GSASR(config, name)
     except (KeyError, ValueError, IndexError, RuntimeError, ZeroDivisionError) as error:
         raise CheckpointError(
@@ -80,6 +83,11 @@ def build(
         if keys:
             more = f" and {len(keys) - 1} more" if len(keys) > 1 else ""
             raise CheckpointError(f"{origin} {what} {keys[0]}{more}; it does not fit its network.")
+    for key, index in state.items():
+        if key.endswith("relative_position_index"):
+            table = state[key.replace("position_index", "position_bias_table")]
+            if int(index.min()) < 0 or int(index.max()) >= table.shape[0]:
+                raise CheckpointError(f"{origin} has a {key} that points outside its table.")
     if not all(bool(torch.isfinite(v).all()) for v in state.values() if v.is_floating_point()):
         raise CheckpointError(
             f"{origin} holds weights that are not finite; train or fetch it anew."

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import importlib
 
-__all__ = ["BACKENDS", "available_backends", "render", "require_backend"]
+BACKENDS = ("reference", "cpu", "gl")
+
+__all__ = ["BACKENDS", "default_backend", "render", "require_backend"]
 
 
 def __getattr__(name: str):

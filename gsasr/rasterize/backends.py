@@ -7,8 +7,8 @@ import torch
 from ..errors import BackendError, RequestError
 from ..gaussians import Gaussians
 from ..view import View
+from . import BACKENDS
 
-BACKENDS = ("reference", "cpu", "gl")
 QUALITIES = ("screen", "export", "gradient")
 
 
@@ -32,7 +32,7 @@ def render(
         raise RequestError(f"Unknown quality {quality!r}; use one of {', '.join(QUALITIES)}.")
     require_backend(backend)
     if backend == "auto":
-        backend = "cpu" if differentiable else available_backends()[0]
+        backend = "cpu" if differentiable else default_backend()
     if backend == "reference":
         from . import reference
 
@@ -56,8 +56,8 @@ def require_backend(backend: str) -> None:
         raise RequestError(f"Unknown backend {backend!r}; use auto, {', '.join(BACKENDS)}.")
 
 
-def available_backends() -> list[str]:
-    """The backends that run here, fastest first."""
+def default_backend() -> str:
+    """What "auto" means for a picture without gradients: "gl" on a hardware GPU, else "cpu"."""
     from . import gl
 
-    return ["gl", "cpu", "reference"] if gl.hardware() else ["cpu", "reference"]
+    return "gl" if gl.hardware() else "cpu"

@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
+
+from ..errors import FieldError
+from .jit import jit
 
 ENTRIES_PER_GAUSSIAN = 48  # beyond this (large Gaussians) the cells grow, so memory stays bounded
 CELLS_PER_GAUSSIAN = 4  # likewise for sparse Gaussians
@@ -18,8 +20,6 @@ FEW = 1 << 16  # cells or entries that are fine however few the Gaussians
 # Standard deviations from the middle of a cell beyond which 2^-(u^2 + v^2) leaves float32, so
 # that a Gaussian cannot be followed along a row by multiplication: 0.5 log2(e) 12.6^2 = 114.
 STEEP = 12.6
-
-_jit = numba.njit(cache=True, nogil=True)
 
 
 @dataclass(frozen=True)
@@ -58,6 +58,8 @@ def build(
     extent = np.sqrt(np.maximum(cut, 0))
     reach = extent[drawn, None] * std[drawn]
     low, high = (mean[drawn] - reach).min(axis=0), (mean[drawn] + reach).max(axis=0)
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        raise FieldError("The Gaussians hold values that are not finite; predict the field anew.")
     while True:
         first, last = np.floor(low / side), np.floor(high / side)
         columns, rows = last - first + 1
@@ -77,7 +79,7 @@ def build(
     return Cells(float(side), corner, counts.shape[:2], offsets.astype(np.uint32), entries)
 
 
-@_jit
+@jit
 def _columns(mean, std, rho, cut, n, y0, y1):
     """Least and greatest x of ellipse n within y0 <= y <= y1; (1, 0) if they do not meet.
 
@@ -97,15 +99,15 @@ def _columns(mean, std, rho, cut, n, y0, y1):
     return mean[n, 0] + std[n, 0] * x0, mean[n, 0] + std[n, 0] * x1
 
 
-@_jit
+@jit
 def _span(low, high, side, first, count):
     """First and one past the last cell that [low, high] touches."""
-    start = math.floor(low / side) - first
-    stop = math.floor(high / side) - first + 1.0
+    start = np.floor(low / side) - first
+    stop = np.floor(high / side) - first + 1.0
     return int(max(start, 0.0)), int(min(stop, float(count)))
 
 
-@_jit
+@jit
 def _count(mean, std, rho, cut, steep, side, first, counts):
     for n in range(cut.shape[0]):
         if not cut[n] >= 0.0:
@@ -122,7 +124,7 @@ def _count(mean, std, rho, cut, steep, side, first, counts):
                 counts[row, column, steep[n]] += 1
 
 
-@_jit
+@jit
 def _fill(mean, std, rho, cut, steep, side, first, cursor, entries):
     for n in range(cut.shape[0]):
         if not cut[n] >= 0.0:

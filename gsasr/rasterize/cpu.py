@@ -12,15 +12,13 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
-import numba
 import numpy as np
 import torch
 
 from ..gaussians import Gaussians
 from ..view import View
 from . import footprint
-
-_jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "nsz"})
+from .jit import jit
 
 
 def render(gaussians: Gaussians, view: View, quality: str = "export") -> torch.Tensor:
@@ -58,17 +56,17 @@ class _Rasterize(torch.autograd.Function):
         return columns[:, 0:2], columns[:, 2:4], columns[:, 4], columns[:, 5:8], None, None
 
 
-@_jit
+@jit
 def _span(center, half, limit):
     """First and one past the last pixel index with |index - center| <= half, in [0, limit)."""
-    first = max(0.0, math.ceil(center - half))
-    last = min(limit - 1.0, math.floor(center + half))
+    first = max(0.0, np.ceil(center - half))
+    last = min(limit - 1.0, np.floor(center + half))
     if first > last:
         return 0, 0
     return int(first), int(last) + 1
 
 
-@_jit
+@jit
 def _forward(mean, std, rho, peak, cut, ox, oy, sx, sy, image, row_start, row_stop):
     """Add the Gaussians to image rows [row_start, row_stop)."""
     width = image.shape[1]
@@ -110,7 +108,7 @@ def _forward(mean, std, rho, peak, cut, ox, oy, sx, sy, image, row_start, row_st
                 ratio *= falloff
 
 
-@_jit
+@jit
 def _backward(mean, std, rho, peak, cut, ox, oy, sx, sy, upstream, grads, start, stop):
     """Gradients of Gaussians [start, stop): sum over their pixels, then the chain rule.
 

@@ -32,23 +32,31 @@ def cut(gaussians: Gaussians, quality: str) -> torch.Tensor:
     if quality == "gradient":
         return torch.full((len(gaussians),), GRADIENT_CUT)
     with torch.no_grad():
-        peak = gaussians.opacity * gaussians.color.amax(dim=1)
-        threshold = TOLERANCE[quality] / max(1.0, _densest(gaussians))
-        return 2.0 * torch.log(peak / threshold).clamp(min=-1.0).to("cpu", torch.float32)
+        peak = (gaussians.opacity * gaussians.color.amax(dim=1)).double()
+        threshold = math.log(TOLERANCE[quality] / max(1.0, _densest(gaussians)))
+        return (2.0 * (peak.log() - threshold)).clamp(min=-1.0).to("cpu", torch.float32)
 
 
 def _densest(gaussians: Gaussians) -> float:
-    """Largest sum of Gaussian areas (2 pi sx sy sqrt(1 - rho^2)) over one source pixel.
+    """Largest sum, over one source pixel, of Gaussian areas 2 pi sx sy sqrt(1 - rho^2).
 
-    It bounds how many Gaussians, each just below the threshold, add up at one place.
+    It bounds how many Gaussians, each just below the threshold, add up at one place. Each counts
+    as at least one pixel, since small ones may sit on top of each other.
     """
     if len(gaussians) == 0:
         return 0.0
     height, width = gaussians.size
     column = gaussians.mean[:, 0].floor().clamp(0, width - 1).long()
     row = gaussians.mean[:, 1].floor().clamp(0, height - 1).long()
-    area = 2 * math.pi * gaussians.std.prod(dim=1) * (1 - gaussians.rho**2).clamp(min=0).sqrt()
-    return float(torch.bincount(row * width + column, weights=area.double()).max())
+    std = gaussians.std.double()
+    area = 2 * math.pi * std.prod(dim=1) * (1 - gaussians.rho.double() ** 2).clamp(min=0).sqrt()
+    # Only the pixels around these Gaussians, which may be a small tile of a large picture.
+    column, row = column - column.min(), row - row.min()
+    across = int(column.max()) + 1
+    pixel = row * across + column
+    if across * (int(row.max()) + 1) > 16 * len(gaussians) + 4096:
+        pixel = pixel.unique(return_inverse=True)[1]
+    return float(torch.bincount(pixel, weights=area.clamp(min=1)).max())
 
 
 def bounds(gaussians: Gaussians, quality: str) -> tuple[float, float, float, float]:

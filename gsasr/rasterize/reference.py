@@ -25,18 +25,21 @@ def render(
     height, width = view.size
     columns = torch.arange(width, dtype=dtype, device=g.mean.device)
     x = view.origin[0] + (columns + 0.5) / view.scale[0]
-    rows_at_once = max(1, CHUNK // max(1, width * len(g)))
+    rows = torch.arange(height, dtype=dtype, device=g.mean.device)
+    y = view.origin[1] + (rows + 0.5) / view.scale[1]
     if torch.is_grad_enabled() and any(t.requires_grad for t in g.tensors().values()):
-        rows_at_once = max(1, height)
-    bands = []
-    for start in range(0, height, rows_at_once):
-        rows = torch.arange(start, min(start + rows_at_once, height), dtype=dtype, device=x.device)
-        y = view.origin[1] + (rows + 0.5) / view.scale[1]
-        bands.append(_band(g, x, y, view, box))
-    return torch.cat(bands) if bands else torch.zeros(0, width, 3, dtype=dtype)
+        return _sum(g, x, y, view, box)
+    image = torch.zeros(height, width, 3, dtype=dtype, device=x.device)
+    some = max(1, min(len(g), CHUNK // max(1, width)))
+    band = max(1, CHUNK // max(1, width * some))
+    for start in range(0, height, band):
+        for first in range(0, len(g), some):
+            part = g[first : first + some]
+            image[start : start + band] += _sum(part, x, y[start : start + band], view, box)
+    return image
 
 
-def _band(
+def _sum(
     g: Gaussians,
     x: torch.Tensor,  # [w] sample positions, source pixels
     y: torch.Tensor,  # [h]

@@ -6,7 +6,7 @@ NumPy and numba only, no OpenGL: this is the heavy part, and it can run on any t
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -76,10 +76,12 @@ def pack(
     quality: "screen" or "export" (see footprint.cut); decides how far each Gaussian reaches.
     sides: of the cells to index by, source pixels, ascending; larger where Gaussians are large.
     """
+    from . import footprint
+
     mean = _array(gaussians.mean)
     std = np.maximum(_array(gaussians.std), THINNEST)
     rho = _array(gaussians.rho)
-    cut = _cut(gaussians, mean, quality)
+    cut = footprint.cut(gaussians, quality).numpy().astype(np.float64)
     levels: list[Cells] = []
     for side in sides:
         if not levels or side > levels[-1].side:
@@ -87,7 +89,9 @@ def pack(
     finest = levels[0]
     rows, columns = finest.shape
     x, y = (first * finest.side for first in finest.first)
-    origin = (math.floor(x), math.floor(y))
+    # Relative to the means, not to the footprints: one huge Gaussian must not cost the others bits.
+    low = np.floor(mean.min(axis=0)) if len(mean) else np.zeros(2)
+    origin = (int(low[0]), int(low[1]))
     root = np.sqrt(1.0 - rho**2)
     records = np.empty((len(gaussians), 8), np.float32)
     records[:, 0:2] = mean - origin
@@ -110,21 +114,6 @@ def visible(gaussians: Gaussians, view: View, quality: str) -> Gaussians:
     mean = _array(gaussians.mean)
     low, high = np.array(view.origin), np.array(view.to_source(view.size[1], view.size[0]))
     return gaussians[((mean + reach >= low) & (mean - reach <= high)).all(axis=1)]
-
-
-def _cut(gaussians: Gaussians, mean: np.ndarray, quality: str) -> np.ndarray:
-    """footprint.cut, which counts per source pixel, told that the picture is only this tile."""
-    from . import footprint
-
-    if len(gaussians) == 0:
-        return np.zeros(0)
-    limit = np.array(gaussians.size[::-1]) - 1
-    low = np.clip(np.floor(mean.min(axis=0)), 0, limit)
-    width, height = (np.clip(np.floor(mean.max(axis=0)), 0, limit) - low + 1).astype(int)
-    local = replace(
-        gaussians, mean=gaussians.mean - gaussians.mean.new_tensor(low), size=(height, width)
-    )
-    return footprint.cut(local, quality).numpy().astype(np.float64)
 
 
 def _array(tensor) -> np.ndarray:

@@ -48,6 +48,12 @@ class TrainConfig:
             raise RequestError("Training scales must satisfy 1 <= scale_min <= scale_max.")
         if min(self.patch, self.batch, self.steps, self.save_every, self.validate_every) < 1:
             raise RequestError("patch, batch, steps, save_every and validate_every must be >= 1.")
+        if len(self.betas) != 2 or not all(0 <= beta < 1 for beta in self.betas):
+            raise RequestError("betas must be two numbers in [0, 1).")
+        if not 0 <= self.ema < 1 or min(self.warmup, self.clip, self.seed, *self.milestones, 0) < 0:
+            raise RequestError("ema must lie in [0, 1); warmup, clip, seed and milestones be >= 0.")
+        if not 0 < self.rate < float("inf") or not 0 < self.decay <= 1:
+            raise RequestError("rate must be above 0, and decay in (0, 1].")
         if self.precision not in ("float32", "bfloat16"):
             raise RequestError("The precision must be float32 or bfloat16.")
 

@@ -50,8 +50,9 @@ class Sample:
 class CropSampler:
     """Random crops of the pictures below a folder; the batch of a step depends on the step alone.
 
-    Pictures are drawn in proportion to their area, and kept decoded (8 bit) once used. One that
-    cannot be decoded is named on stderr and left out from then on.
+    Pictures are drawn in proportion to their area, and all kept decoded (8 bit) once used. One
+    that turns out damaged is named on stderr and left out from then on; only then a batch also
+    depends on the batches before it.
     """
 
     def __init__(self, folder: str | os.PathLike, patch: int, scales: tuple[float, float]) -> None:

@@ -14,8 +14,9 @@ import torch
 from tqdm import tqdm
 
 from .. import rasterize
-from ..errors import DataError
+from ..errors import DataError, RequestError
 from ..evaluation.metrics import psnr_y
+from ..files import writing
 from ..model import GSASR, activate, save_model
 from ..model import PRESETS as MODELS
 from ..view import View
@@ -43,17 +44,22 @@ def train(
     network.
     """
     out = Path(out)
+    multiple = MODELS[preset].decoder.window
+    if config.patch % multiple:
+        raise RequestError(f"--patch must be a multiple of {multiple} for {preset}.")
+    sampler = CropSampler(data, config.patch, (config.scale_min, config.scale_max))
+    pairs = validation_pairs(valid) if valid else []
     try:
         out.mkdir(parents=True, exist_ok=True)
+        for stale in (*out.glob(".state-*.pt"), *out.glob(".model-*.safetensors")):
+            stale.unlink()  # half a file of a run that was killed
     except OSError as error:
-        raise DataError(f"Cannot make the folder {out}: {error.strerror}.") from error
+        raise DataError(f"Cannot write to the folder {out}: {error.strerror}.") from error
     torch.manual_seed(config.seed)
     model = GSASR(MODELS[preset], preset).train()
     state = TrainState.fresh(model, config.betas)
     if (out / "state.pt").exists():
         state.load(out / "state.pt")
-    sampler = CropSampler(data, config.patch, (config.scale_min, config.scale_max))
-    pairs = validation_pairs(valid) if valid else []
     log = Log(out / "log.csv", state.step)
 
     bar = tqdm(total=config.steps, initial=state.step, unit="step", disable=None)
@@ -70,18 +76,24 @@ def train(
             state.save(out / "state.pt")
             save_model(state.average, out / "model.safetensors", describe(config, state.step))
     bar.close()
+    # Once more: the last run may have been killed between the two.
+    save_model(state.average, out / "model.safetensors", describe(config, state.step))
     return out / "model.safetensors"
 
 
 def train_step(state: TrainState, samples: list[Sample], rate: float, config: TrainConfig) -> float:
-    """One step of Adam on a batch; returns its L1 loss."""
+    """One step of Adam on a batch; returns its L1 loss. Raises DataError if it is not finite."""
     for group in state.optimizer.param_groups:
         group["lr"] = rate
     loss = batch_loss(state.model, samples, config.precision)
     state.optimizer.zero_grad(set_to_none=True)
     loss.backward()
-    if config.clip:
-        torch.nn.utils.clip_grad_norm_(state.model.parameters(), config.clip)
+    norm = torch.nn.utils.clip_grad_norm_(state.model.parameters(), config.clip or float("inf"))
+    if not bool(norm.isfinite()) or not bool(loss.isfinite()):
+        raise DataError(
+            f"Training diverged at step {state.step + 1}; run it again with a lower --rate. "
+            "What was saved before is kept."
+        )
     state.optimizer.step()
     state.step += 1
     state.update_average(config.ema)
@@ -95,6 +107,8 @@ def batch_loss(model: GSASR, samples: list[Sample], precision: str) -> torch.Ten
     with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bfloat16"):
         raw = model(lr, scales)
     losses = []
+    if not bool(raw.isfinite().all()):  # a rasterizer would draw these as nothing
+        return raw.sum()
     for columns, sample in zip(raw.float(), samples, strict=True):
         gaussians = activate(columns, tuple(sample.lr.shape[1:]))
         rendered = rasterize.render(gaussians, crop_view(sample), backend="cpu")
@@ -130,28 +144,31 @@ class Log:
 
     def __init__(self, path: Path, step: int) -> None:
         self.path = path
-        rows = []
+        self._rows: list[dict[str, str]] = []
         if path.exists() and step:
             with path.open(newline="") as file:
-                rows = [row for row in csv.DictReader(file) if int(row["step"]) <= step]
-        self._started = time.monotonic() - (float(rows[-1]["seconds"]) if rows else 0.0)
+                rows = list(csv.DictReader(file))
+            self._rows = [
+                row for row in rows if None not in row.values() and int(row["step"]) <= step
+            ]
+        before = float(self._rows[-1]["seconds"]) if self._rows else 0.0
+        self._started = time.monotonic() - before
         self._losses: list[float] = []
-        with path.open("w", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS)
-            writer.writeheader()
-            writer.writerows(rows)
 
     def loss(self, value: float) -> None:
         self._losses.append(value)
 
     def write(self, step: int, rate: float, scores: dict[str, float]) -> dict[str, str]:
-        """Append the mean loss since the last row; returns the row."""
+        """Add the mean loss since the last row; returns the row. Raises DataError."""
         row = {name: f"{scores[name]:.3f}" if name in scores else "" for name in COLUMNS}
         row["step"] = str(step)
         row["seconds"] = f"{time.monotonic() - self._started:.0f}"
         row["loss"] = f"{np.mean(self._losses):.5f}"
         row["rate"] = f"{rate:.2e}"
         self._losses.clear()
-        with self.path.open("a", newline="") as file:
-            csv.DictWriter(file, COLUMNS).writerow(row)
+        self._rows.append(row)
+        with writing(self.path, DataError) as beside, beside.open("w", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS)
+            writer.writeheader()
+            writer.writerows(self._rows)
         return row

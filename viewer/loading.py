@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gsasr.errors import FieldError, ImageError, RequestError
+from gsasr.errors import FieldError, ImageError
+from gsasr.files import require_file
 
 from .state import Document, Rectangle
 from .worker import Task
@@ -179,14 +180,4 @@ def split(field: Gaussians) -> Iterator[tuple[Gaussians, Rectangle]]:
 
 def check_path(path: Path) -> None:
     """Raise at once for what `open` would refuse later: no such file, a folder."""
-    error = FieldError if path.suffix.lower() == FIELD_SUFFIX else ImageError
-    if path.is_dir():
-        raise ImageError(f"{path} is a folder; give a picture in it.")
-    if not path.is_file():
-        raise error(f"{path} does not exist; check the path.")
-
-
-def check_condition(scale: float) -> None:
-    """Raise RequestError for a conditioning scale that makes no sense."""
-    if not np.isfinite(scale) or scale <= 0:
-        raise RequestError(f"The conditioning scale must be above 0, but is {scale:g}.")
+    require_file(path, FieldError if path.suffix.lower() == FIELD_SUFFIX else ImageError)

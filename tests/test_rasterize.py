@@ -13,7 +13,7 @@ from safetensors import safe_open
 from gsasr.errors import RequestError
 from gsasr.gaussians import Gaussians
 from gsasr.model import activate
-from gsasr.rasterize import cpu, footprint, reference, render
+from gsasr.rasterize import footprint, reference, render
 from gsasr.view import View
 
 TOLERANCES = {"screen": 1e-3, "export": 1e-4}
@@ -42,7 +42,7 @@ def test_cpu_agrees_with_the_oracle_at_every_scale(scale, quality):
     field = random_field(600, (9, 13))
     view = View.at_scale(field.size, scale)
     oracle = reference.render(field, view)
-    assert largest_difference(cpu.render(field, view, quality), oracle) < TOLERANCES[quality]
+    assert largest_difference(render(field, view, "cpu", quality), oracle) < TOLERANCES[quality]
 
 
 @pytest.mark.parametrize("quality", TOLERANCES)
@@ -52,7 +52,7 @@ def test_cpu_agrees_with_the_oracle_on_predicted_gaussians(golden, scale, qualit
         field = activate(file.get_tensor("io.raw")[0], (12, 16))
     view = View.at_scale(field.size, scale)
     oracle = reference.render(field, view)  # up to 6: untrained, so far from a picture
-    assert largest_difference(cpu.render(field, view, quality), oracle) < TOLERANCES[quality]
+    assert largest_difference(render(field, view, "cpu", quality), oracle) < TOLERANCES[quality]
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_cpu_agrees_with_the_oracle_on_predicted_gaussians(golden, scale, qualit
 )
 def test_cpu_agrees_with_the_oracle_in_any_region(view):
     field = random_field(500, (9, 13))
-    difference = largest_difference(cpu.render(field, view), reference.render(field, view))
+    difference = largest_difference(render(field, view, "cpu"), reference.render(field, view))
     assert difference < 1e-4
 
 
@@ -89,7 +89,7 @@ def test_cpu_agrees_with_the_oracle_in_any_region(view):
 @pytest.mark.parametrize("scale", [1, 4, 31])
 def test_cpu_agrees_with_the_oracle_on_extremes(field, scale):
     view = View.at_scale((1, 1), scale)
-    image = cpu.render(field, view)
+    image = render(field, view, "cpu")
     assert bool(torch.isfinite(image).all())
     assert largest_difference(image, reference.render(field, view)) < 1e-4
 
@@ -156,7 +156,7 @@ def test_the_reference_reproduces_the_papers_rasterization_ratio(golden):
 def test_cpu_gradients_are_bit_equal_from_run_to_run():
     def gradients():
         field = random_field(6000, (24, 24)).map(lambda t: t.clone().requires_grad_(True))
-        cpu.render(field, View.at_scale((24, 24), 3), "gradient").square().sum().backward()
+        render(field, View.at_scale((24, 24), 3), "cpu", "gradient").square().sum().backward()
         return [tensor.grad for tensor in field.tensors().values()]
 
     for first, second in zip(gradients(), gradients(), strict=True):
@@ -213,10 +213,12 @@ def test_many_tiny_gaussians_at_one_place_stay_within_the_tolerance(quality):
     field.mean[:], field.std[:], field.rho[:] = 0.5, 0.1, 0.0
     field.opacity[:], field.color[:] = 1e-3, 1.0
     view = View.at_scale((1, 1), 40)
-    difference = largest_difference(cpu.render(field, view, quality), reference.render(field, view))
+    difference = largest_difference(
+        render(field, view, "cpu", quality), reference.render(field, view)
+    )
     assert difference < TOLERANCES[quality]
 
 
 def test_an_enormous_gaussian_is_drawn():
     field = one((0.5, 0.5), (1e18, 1e18), opacity=0.5)
-    assert cpu.render(field, View.at_scale((1, 1), 3)).mean() == pytest.approx(0.5)
+    assert render(field, View.at_scale((1, 1), 3), "cpu").mean() == pytest.approx(0.5)

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import importlib
 
-BACKENDS = ("reference", "cpu", "gl")
+BACKENDS = ("reference", "cpu", "cuda", "gl")
 
-__all__ = ["BACKENDS", "default_backend", "render", "require_backend"]
+__all__ = ["BACKENDS", "default_backend", "render", "render_batch", "require_backend"]
 
 
 def __getattr__(name: str):

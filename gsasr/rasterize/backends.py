@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import torch
 
-from ..errors import BackendError, RequestError
+from ..errors import RequestError
 from ..gaussians import Gaussians
 from ..view import View
 from . import BACKENDS
 
+DIFFERENTIABLE = ("cpu", "cuda")  # also the names of their devices
 QUALITIES = ("screen", "export", "gradient")
 
 
@@ -17,43 +18,83 @@ def render(
 ) -> torch.Tensor:
     """(h, w, 3) float32 image of the Gaussians through the view, not clamped.
 
-    backend: "reference" (dense, for tests), "cpu", "gl" (OpenGL 4.3, headless where there is no
-        window), or "auto": "cpu" if a gradient is wanted, else "gl" on a hardware GPU, else "cpu".
+    backend: "reference" (dense, for tests), "cpu", "cuda" (NVIDIA), "gl" (OpenGL 4.3, headless
+        where there is no window), or "auto": where the Gaussians are ("cuda" or "cpu") if that
+        is a card or if a gradient is wanted, else "gl" on a hardware GPU, else "cpu".
     quality: "screen" (error below half an 8-bit step), "export" (below 1e-4) or "gradient"
         (for training); by default "gradient" if a tensor requires it, else "export".
 
-    Raises BackendError where the backend cannot run, RequestError for an unknown name.
+    The image of "cuda" stays on the card, the others' is on the CPU. Raises BackendError where
+    the backend cannot run, RequestError for an unknown name.
     """
-    differentiable = torch.is_grad_enabled() and any(
+    backend, quality = _chosen(gaussians, backend, quality)
+    if backend == "reference":
+        from . import reference
+
+        return reference.render(gaussians, view).float()
+    if backend == "gl":
+        from . import gl
+
+        if _differentiable(gaussians):
+            raise RequestError("The gl backend has no gradients; use backend='cpu' or 'cuda'.")
+        return torch.from_numpy(gl.render(gaussians, view, quality))
+    from . import operator
+
+    return operator.draw(_moved(gaussians, backend), [len(gaussians)], [view], quality)[0]
+
+
+def render_batch(
+    gaussians: Gaussians,
+    counts: list[int],
+    views: list[View],
+    backend: str = "auto",
+    quality: str | None = None,
+) -> list[torch.Tensor]:
+    """As `render` for several pictures of any sizes at once, by "cpu" or "cuda".
+
+    gaussians: of all pictures, one after the other; counts: how many each has; views: of each.
+    """
+    if sum(counts) != len(gaussians) or len(counts) != len(views):
+        raise RequestError("There must be one view and one count per picture, adding up to all.")
+    backend, quality = _chosen(gaussians, backend, quality)
+    if backend not in DIFFERENTIABLE:
+        backend = gaussians.mean.device.type
+    from . import operator
+
+    return operator.draw(_moved(gaussians, backend), counts, views, quality)
+
+
+def _differentiable(gaussians: Gaussians) -> bool:
+    return torch.is_grad_enabled() and any(
         tensor.requires_grad for tensor in gaussians.tensors().values()
     )
+
+
+def _chosen(gaussians: Gaussians, backend: str, quality: str | None) -> tuple[str, str]:
+    """The backend that "auto" stands for here and the quality, or an error."""
+    differentiable = _differentiable(gaussians)
     quality = quality or ("gradient" if differentiable else "export")
     if quality not in QUALITIES:
         raise RequestError(f"Unknown quality {quality!r}; use one of {', '.join(QUALITIES)}.")
     require_backend(backend)
     if backend == "auto":
-        backend = "cpu" if differentiable else default_backend()
-    if backend == "reference":
-        from . import reference
+        there = gaussians.mean.device.type
+        backend = there if differentiable or there == "cuda" else default_backend()
+    return backend, quality
 
-        return reference.render(gaussians, view).float()
-    if backend == "cpu":
-        from . import cpu
 
-        return cpu.render(gaussians, view, quality)
-    from . import gl
-
-    if differentiable:
-        raise RequestError("The gl backend has no gradients; use backend='cpu'.")
-    return torch.from_numpy(gl.render(gaussians, view, quality))
+def _moved(gaussians: Gaussians, device: str) -> Gaussians:
+    return gaussians.map(lambda tensor: tensor.to(device, torch.float32))
 
 
 def require_backend(backend: str) -> None:
     """Raise the error that `render` would raise for this name, without drawing."""
-    if backend == "cuda":
-        raise BackendError("The cuda backend is not written yet; use --backend cpu or gl.")
     if backend not in ("auto", *BACKENDS):
         raise RequestError(f"Unknown backend {backend!r}; use auto, {', '.join(BACKENDS)}.")
+    if backend == "cuda":
+        from . import cuda
+
+        cuda.require()
 
 
 def default_backend() -> str:

@@ -14,46 +14,50 @@ from itertools import pairwise
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from ..gaussians import Gaussians
-from ..view import View
-from . import footprint
+from .batch import Picture
 from .jit import jit
 
 
-def render(gaussians: Gaussians, view: View, quality: str = "export") -> torch.Tensor:
-    """(h, w, 3) float32 image on the CPU, not clamped; differentiable in all five tensors.
+def forward(
+    mean: Tensor, std: Tensor, rho: Tensor, peak: Tensor, cut: Tensor, batch: list[Picture]
+) -> Tensor:
+    """(P, 3) pixels of all pictures; arguments as of `operator.rasterize`, on the CPU."""
+    arrays = _arrays(mean, std, rho, peak, cut)
+    pixels = np.zeros((batch[-1].pixels.stop if batch else 0, 3), np.float32)
+    calls = []
+    for picture in batch:
+        own = [array[picture.gaussians] for array in arrays]
+        image = pixels[picture.pixels].reshape(*picture.view.size, 3)
+        bands = _runs(picture.view.size[0], image.size * 8 < 1 << 18)
+        calls += [(*own, *_geometry(picture), image, start, stop) for start, stop in bands]
+    _run(_forward, calls)
+    return torch.from_numpy(pixels)
 
-    quality: "screen", "export" or "gradient" (see footprint.cut).
-    """
-    g = gaussians.map(lambda tensor: tensor.to("cpu", torch.float32))
-    return _Rasterize.apply(g.mean, g.std, g.rho, g.peak, footprint.cut(g, quality), view)
 
-
-class _Rasterize(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, mean, std, rho, peak, cut, view):
-        ctx.save_for_backward(mean, std, rho, peak, cut)
-        ctx.view = view
-        arrays = [np.ascontiguousarray(t.detach().numpy()) for t in (mean, std, rho, peak, cut)]
-        image = np.zeros((*view.size, 3), np.float32)
-        tasks = 1 if image.size * 8 < 1 << 18 else 4 * _threads()
-        bounds = np.linspace(0, view.size[0], tasks + 1).astype(np.int64)
-        geometry = (*view.origin, *view.scale)
-        _run(_forward, [(*arrays, *geometry, image, a, b) for a, b in _pairs(bounds)])
-        return torch.from_numpy(image)
-
-    @staticmethod
-    def backward(ctx, image_grad):
-        arrays = [np.ascontiguousarray(t.detach().numpy()) for t in ctx.saved_tensors]
-        upstream = np.ascontiguousarray(image_grad.numpy(), np.float32)
-        n = arrays[0].shape[0]
-        grads = np.zeros((n, 8), np.float32)  # mean 2, std 2, rho, peak 3
-        bounds = np.linspace(0, n, (1 if n < 4096 else 4 * _threads()) + 1).astype(np.int64)
-        geometry = (*ctx.view.origin, *ctx.view.scale)
-        _run(_backward, [(*arrays, *geometry, upstream, grads, a, b) for a, b in _pairs(bounds)])
-        columns = torch.from_numpy(grads)
-        return columns[:, 0:2], columns[:, 2:4], columns[:, 4], columns[:, 5:8], None, None
+def backward(
+    upstream: Tensor,
+    mean: Tensor,
+    std: Tensor,
+    rho: Tensor,
+    peak: Tensor,
+    cut: Tensor,
+    batch: list[Picture],
+) -> Tensor:
+    """(N, 8) gradients of mean 2, std 2, rho, peak 3; arguments as of `forward`."""
+    arrays = _arrays(mean, std, rho, peak, cut)
+    (gradient,) = _arrays(upstream)
+    grads = np.zeros((len(arrays[0]), 8), np.float32)
+    calls = []
+    for picture in batch:
+        own = [array[picture.gaussians] for array in arrays]
+        image = gradient[picture.pixels].reshape(*picture.view.size, 3)
+        out = grads[picture.gaussians]
+        runs = _runs(len(out), len(out) < 4096)
+        calls += [(*own, *_geometry(picture), image, out, start, stop) for start, stop in runs]
+    _run(_backward, calls)
+    return torch.from_numpy(grads)
 
 
 @jit
@@ -183,15 +187,26 @@ def _threads() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _pairs(bounds: np.ndarray) -> list[tuple[int, int]]:
+def _arrays(*tensors: Tensor) -> list[np.ndarray]:
+    return [tensor.detach().contiguous().numpy() for tensor in tensors]
+
+
+def _geometry(picture: Picture) -> tuple[float, float, float, float]:
+    return (*picture.view.origin, *picture.view.scale)
+
+
+def _runs(length: int, small: bool) -> list[tuple[int, int]]:
+    """[0, length) cut into parts for the threads; one part if the work is small."""
+    bounds = np.linspace(0, length, (1 if small else 4 * _threads()) + 1).astype(np.int64)
     return [(int(a), int(b)) for a, b in pairwise(bounds) if a < b]
 
 
 def _run(kernel, calls: list[tuple]) -> None:
     """Call the kernel once per argument tuple, in parallel; it releases the GIL."""
     global _pool
-    if len(calls) == 1:
-        kernel(*calls[0])
+    if len(calls) <= 1:
+        for call in calls:
+            kernel(*call)
         return
     if _pool is None:
         _pool = ThreadPoolExecutor(_threads(), thread_name_prefix="rasterize")

@@ -25,16 +25,16 @@ GRADIENT_CUT = 5.0**2  # tails of second moments: (1 + k^2/2) exp(-k^2/2) = 5e-5
 
 
 def cut(gaussians: Gaussians, quality: str) -> torch.Tensor:
-    """(N,) float32: draw where q(x) <= cut; a negative value means nowhere.
+    """(N,) float32: draw where q(x) <= cut; a negative value means nowhere. Same device.
 
     quality: "screen", "export" or "gradient".
     """
     if quality == "gradient":
-        return torch.full((len(gaussians),), GRADIENT_CUT)
+        return torch.full_like(gaussians.opacity, GRADIENT_CUT, requires_grad=False)
     with torch.no_grad():
         peak = (gaussians.opacity * gaussians.color.amax(dim=1)).double()
         threshold = math.log(TOLERANCE[quality] / max(1.0, _densest(gaussians)))
-        return (2.0 * (peak.log() - threshold)).clamp(min=-1.0).to("cpu", torch.float32)
+        return (2.0 * (peak.log() - threshold)).clamp(min=-1.0).float()
 
 
 def _densest(gaussians: Gaussians) -> float:

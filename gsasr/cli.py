@@ -208,7 +208,7 @@ def parser() -> argparse.ArgumentParser:
 
     def add_backend(command: argparse.ArgumentParser) -> None:
         command.add_argument(
-            "--backend", choices=("auto", *BACKENDS, "cuda"), default="auto", help="rasterizer"
+            "--backend", choices=("auto", *BACKENDS), default="auto", help="rasterizer"
         )
 
     def add_output(command: argparse.ArgumentParser, help: str) -> None:

@@ -89,7 +89,7 @@ def _sum_of(
         if window is not None:
             with torch.no_grad():
                 drawn = rasterize.render(part, window, backend, "export")
-            picture[rows, columns] += drawn.numpy()
+            picture[rows, columns] += drawn.cpu().numpy()
         progress(share)
     return picture
 

@@ -20,12 +20,13 @@ def render(
 
     backend: "reference" (dense, for tests), "cpu", "cuda" (NVIDIA), "gl" (OpenGL 4.3, headless
         where there is no window), or "auto": where the Gaussians are ("cuda" or "cpu") if that
-        is a card or if a gradient is wanted, else "gl" on a hardware GPU, else "cpu".
+        is a card or if a gradient is wanted, else the first of "gl" on a GPU, "cuda", "cpu"
+        that there is.
     quality: "screen" (error below half an 8-bit step), "export" (below 1e-4) or "gradient"
         (for training); by default "gradient" if a tensor requires it, else "export".
 
-    The image of "cuda" stays on the card, the others' is on the CPU. Raises BackendError where
-    the backend cannot run, RequestError for an unknown name.
+    The image of "cuda" stays on the card. Raises BackendError where the backend cannot run,
+    RequestError for an unknown name.
     """
     backend, quality = _chosen(gaussians, backend, quality)
     if backend == "reference":
@@ -37,7 +38,7 @@ def render(
 
         if _differentiable(gaussians):
             raise RequestError("The gl backend has no gradients; use backend='cpu' or 'cuda'.")
-        return torch.from_numpy(gl.render(gaussians, view, quality))
+        return torch.from_numpy(gl.render(_moved(gaussians, "cpu"), view, quality))
     from . import operator
 
     return operator.draw(_moved(gaussians, backend), [len(gaussians)], [view], quality)[0]
@@ -98,7 +99,9 @@ def require_backend(backend: str) -> None:
 
 
 def default_backend() -> str:
-    """What "auto" means for a picture without gradients: "gl" on a hardware GPU, else "cpu"."""
+    """What "auto" means for a picture without gradients: "gl" on a GPU, else "cuda" or "cpu"."""
     from . import gl
 
-    return "gl" if gl.hardware() else "cpu"
+    if gl.hardware():
+        return "gl"
+    return "cuda" if torch.cuda.is_available() else "cpu"

@@ -11,30 +11,12 @@ import argparse
 import time
 
 import numpy as np
-import torch
+from fields import plane
 
-from gsasr.gaussians import Gaussians
 from gsasr.rasterize import gl
 from gsasr.view import View
 
 ZOOMS = (1, 2, 4, 8, 12, 16, 64, 1000)
-
-
-def field(height: int, width: int, per_pixel: int, std: tuple[float, float]) -> Gaussians:
-    """A plane of random Gaussians, evenly spread, that sum to about 0.5."""
-    rng = torch.Generator().manual_seed(0)
-    n = height * width * per_pixel
-    spread = std[0] + (std[1] - std[0]) * torch.rand(n, 2, generator=rng)
-    rho = 1.6 * torch.rand(n, generator=rng) - 0.8
-    area = 2 * torch.pi * spread.prod(dim=1) * (1 - rho**2).sqrt()
-    return Gaussians(
-        mean=torch.rand(n, 2, generator=rng) * torch.tensor([float(width), float(height)]),
-        std=spread,
-        rho=rho,
-        color=torch.rand(n, 3, generator=rng),
-        opacity=(1 / (per_pixel * area)).clamp(max=1),
-        size=(height, width),
-    )
 
 
 def main() -> None:
@@ -55,7 +37,7 @@ def main() -> None:
     print("|---|---|---|---|---|---|")
     for zoom in arguments.zooms:
         sides = [int(np.ceil(length / zoom)) + 4 for length in (height, width)]
-        gaussians = field(*sides, arguments.per_pixel, arguments.std)
+        gaussians = plane(*sides, arguments.per_pixel, arguments.std)
         start = time.perf_counter()
         packed = [gl.pack(part) for part in gl.split_tiles(gaussians)]
         packing = time.perf_counter() - start

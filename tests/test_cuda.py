@@ -1,17 +1,14 @@
 """The CUDA rasterizer: on a card where there is one, else its kernels built for this host."""
 
-import ctypes
-import subprocess
 import sys
 from pathlib import Path
-from shutil import which
 
 import pytest
 import torch
 from fields import one, random_field
+from host_kernels import built
 
 from gsasr.errors import BackendError, RequestError
-from gsasr.files import shipped
 from gsasr.gaussians import Gaussians
 from gsasr.rasterize import cuda, footprint, nvrtc, operator, reference, render, render_batch
 from gsasr.rasterize.batch import pictures, views_tensor
@@ -36,22 +33,11 @@ VIEWS = {
 @pytest.fixture(scope="session")
 def host(tmp_path_factory):
     """Launches kernels.cu on this host, thread after thread."""
-    compiler = which("c++") or which("g++") or which("clang++")
-    if compiler is None:
-        pytest.skip("needs a C++ compiler")
-    library = tmp_path_factory.mktemp("host") / "kernels.so"
-    includes = [f"-I{KERNELS.parent}", f"-I{shipped('shaders')}"]
-    options = ["-shared", "-fPIC", "-O2", "-std=c++17", "-Wall", "-Werror", "-Wno-unknown-pragmas"]
-    source = HERE / "host_kernels.cpp"
-    subprocess.run([compiler, *options, *includes, source, "-o", library], check=True)
-    kernels = ctypes.CDLL(str(library))
-
-    def launch(name: str, threads: int, *arguments) -> None:
-        pointers, _keep = cuda.packed(arguments)
-        assert kernels.launch(name.encode(), ctypes.c_longlong(threads), pointers) == 0
-
-    launch.library = kernels
-    return launch
+    sizes = (
+        'extern "C" int size_of_picture() { return sizeof(Picture); }'
+        'extern "C" int size_of_splat() { return sizeof(Splat); }'
+    )
+    return built(KERNELS, tmp_path_factory.mktemp("host"), sizes)
 
 
 @pytest.fixture(params=["host", pytest.param("card", marks=pytest.mark.cuda)])

@@ -1,0 +1,263 @@
+"""Time the differentiable rasterizers, and the paper's algorithm beside them.
+
+    python benchmarks/rasterize.py --sources 48 180 --scales 2 4
+
+Prints a markdown table. Every source has 16 Gaussians per pixel, with standard deviations of 0.2
+to 0.55 source pixels; images and gradients are cut at 5 standard deviations, as in training.
+
+forward, both: medians; "both" is forward and backward. On a card, all steps are in them.
+memory: peak of what one forward and backward pass allocate.
+evaluations: pairs of a pixel and a Gaussian within 5 standard deviations, by area, per second
+    of the forward pass; float32: those times 12 operations, as a share of the card's peak.
+gather: pairs that the gather kernel evaluates, inside an ellipse or not, as a share of what the
+    card can do. Each needs one exponential; those run on 16 units per multiprocessor, which is
+    the narrowest place: the other seven instructions have 128.
+paper: Algorithm 1 of the paper with its box of r = 0.1; the ratios are to it. Where its work is
+    too long (`--most` steps), it runs on a part of the Gaussians and the time is scaled up.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from ctypes import c_float, c_int
+from pathlib import Path
+
+import numba
+import numpy as np
+import torch
+from fields import plane
+
+from gsasr.gaussians import Gaussians
+from gsasr.rasterize import cuda, footprint, nvrtc, render
+from gsasr.rasterize.batch import pictures, views_tensor
+from gsasr.view import View
+
+R = 0.1  # the paper's rasterization ratio
+OPERATIONS = 12  # float32 operations of one evaluation
+EXPONENTIALS = 16  # per clock and multiprocessor, of every architecture since Turing
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    options.add_argument("--sources", type=int, nargs="+", default=[48, 180, 360, 512])
+    options.add_argument("--scales", type=float, nargs="+", default=[2, 4, 8, 12])
+    options.add_argument("--repeats", type=int, default=5)
+    options.add_argument("--most", type=float, default=2e9, help="pixel visits by the paper's loop")
+    arguments = options.parse_args()
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    print(f"{machine(device)}, PyTorch {torch.__version__}\n")
+    print("| source | scale | Gaussians | backend | forward, ms | both, ms | memory, MiB "
+          "| evaluations, G/s | float32 | gather | forward : paper | both : paper |")  # fmt: skip
+    print("|---|---|---|---|---|---|---|---|---|---|---|---|")
+    for side in arguments.sources:
+        field = plane(side, side, 16)
+        for scale in arguments.scales:
+            view = View.at_scale(field.size, scale)
+            baseline = paper_on_card if device == "cuda" else paper_on_host
+            slow = baseline(field, view, arguments.most)
+            for backend in (device, *(["cpu"] if device == "cuda" and side <= 180 else [])):
+                row(field, view, backend, arguments.repeats, slow)
+            part = f" ({slow[2]:.1%})" if slow[2] < 1 else ""
+            both = f"{slow[1]:.0f}" if slow[1] else "-"
+            head = f"| {side}x{side} | {scale:g} | {len(field):,} | paper{part} "
+            print(f"{head}| {slow[0]:.0f} | {both} | - | - | - | - | 1 | 1 |", flush=True)
+
+
+def row(
+    field: Gaussians,
+    view: View,
+    backend: str,
+    repeats: int,
+    slow: tuple[float, float, float],
+) -> None:
+    """Print a row of the table. slow: the baseline's forward and both, ms."""
+    area = math.pi * field.std.prod(1) * (1 - field.rho**2).sqrt() * math.prod(view.scale)
+    field = field.map(lambda tensor: tensor.clone().to(backend).requires_grad_(True))
+
+    def forward() -> torch.Tensor:
+        return render(field, view, backend, "gradient")
+
+    def both() -> None:
+        forward().sum().backward()
+
+    both()
+    memory = peak_memory(both, backend)
+    times = [median_ms(work, backend, repeats) for work in (forward, both)]
+    rate = footprint.GRADIENT_CUT * float(area.sum()) / times[0] / 1e6  # G/s
+    shares = card_shares(field, view, rate) if backend == "cuda" else ("-", "-")
+    ratios = [f"{a / b:.1f}" if a else "-" for a, b in zip(slow[:2], times, strict=True)]
+    cells = [
+        f"{field.size[1]}x{field.size[0]}", f"{view.scale[0]:g}", f"{len(field):,}", backend,
+        f"{times[0]:.3g}", f"{times[1]:.3g}", f"{memory / 2**20:.0f}", f"{rate:.2f}",
+        *shares, *ratios,
+    ]  # fmt: skip
+    print(f"| {' | '.join(cells)} |", flush=True)
+
+
+def median_ms(work: Callable[[], object], backend: str, repeats: int) -> float:
+    """Median wall time of `repeats` calls, milliseconds, after one that is not counted."""
+    times = []
+    for _ in range(repeats + 1):
+        finish(backend)
+        start = time.perf_counter()
+        work()
+        finish(backend)
+        times.append(1e3 * (time.perf_counter() - start))
+    return statistics.median(times[1:])
+
+
+def finish(backend: str) -> None:
+    if backend == "cuda":
+        torch.cuda.synchronize()
+
+
+def peak_memory(work: Callable[[], object], backend: str) -> int:
+    """Bytes by which memory grows at most during the work."""
+    if backend == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated()
+        work()
+        return torch.cuda.max_memory_allocated() - before
+    Path("/proc/self/clear_refs").write_text("5")  # Linux: forget the highest resident size
+    before = resident("VmRSS")
+    work()
+    return resident("VmHWM") - before
+
+
+def resident(name: str) -> int:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(name))
+
+
+def card_shares(field: Gaussians, view: View, rate: float) -> tuple[str, str]:
+    """Shares of the card's float32 peak, and of its exponentials in the gather kernel alone."""
+    properties = torch.cuda.get_device_properties(0)
+    units = properties.multi_processor_count
+    clock = clock_rate()
+    lanes = 64 if (properties.major, properties.minor) in ((7, 5), (8, 0)) else 128
+    peak = 2 * lanes * units * clock
+    tensors, batch = launch_arguments(field, view)
+    pairs, seconds = gather_time(tensors, batch)
+    return (
+        f"{OPERATIONS * rate * 1e9 / peak:.1%}",
+        f"{pairs / seconds / (EXPONENTIALS * units * clock):.0%}",
+    )
+
+
+def clock_rate() -> float:
+    """Highest clock of the card, Hz."""
+    from cuda.bindings import driver
+
+    attribute = driver.CUdevice_attribute.CU_DEVICE_ATTRIBUTE_CLOCK_RATE
+    return 1e3 * driver.cuDeviceGetAttribute(attribute, torch.cuda.current_device())[1]
+
+
+def launch_arguments(field: Gaussians, view: View) -> tuple[list[torch.Tensor], list]:
+    with torch.no_grad():
+        cut = footprint.cut(field, "gradient")
+        tensors = [field.mean, field.std, field.rho, field.peak, cut]
+    batch = pictures(views_tensor([view]), [len(field)], [view.size[0]], [view.size[1]])
+    return [tensor.detach() for tensor in tensors], batch
+
+
+def gather_time(tensors: list[torch.Tensor], batch: list) -> tuple[int, float]:
+    """(pairs of pixels and Gaussians, seconds) of the gather kernel within one forward pass."""
+    launch = cuda.kernels(tensors[0].device)
+    pairs, seconds = 0, 0.0
+
+    def timed(name: str, threads: int, *arguments) -> None:
+        nonlocal pairs, seconds
+        if name != "gather":
+            launch(name, threads, *arguments)
+            return
+        start, stop = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        start.record()
+        launch(name, threads, *arguments)
+        stop.record()
+        stop.synchronize()
+        seconds += start.elapsed_time(stop) / 1e3
+        owners, tile = arguments[2], arguments[-2].value
+        pairs += len(owners) * tile**2
+
+    for _ in range(3):  # the last counts
+        pairs, seconds = 0, 0.0
+        cuda.forward(*tensors, batch, timed)
+    return pairs, seconds
+
+
+def paper_on_card(field: Gaussians, view: View, most: float) -> tuple[float, float, float]:
+    """Algorithm 1 on the card: ms of forward and both, share of the Gaussians that were drawn."""
+    device = torch.device("cuda", torch.cuda.current_device())
+    major, minor = torch.cuda.get_device_capability(device)
+    binary = nvrtc.compiled(10 * major + minor, Path(__file__).with_name("paper.cu"))
+    launch = cuda.module(binary, device)
+    height, width = view.size
+    count = max(1, min(len(field), int(100 * most / (height * width))))
+    # A sample from all over the picture, as many threads at a time as the card runs.
+    some = field[torch.linspace(0, len(field) - 1, count).long()]
+    tensors = [t.to(device).contiguous() for t in (some.mean, some.std, some.rho, some.peak)]
+    box = c_float(R * (width - 1) / 2), c_float(R * (height - 1) / 2)
+    shared = (*tensors, c_float(view.scale[0]), *box, c_int(width), c_int(height))
+    pixels = torch.zeros(height, width, 3, device=device)
+    grads = torch.zeros(count, 8, device=device)
+
+    def forward() -> None:
+        launch("paper_forward", count, count, *shared, pixels.zero_())
+
+    def both() -> None:
+        forward()
+        launch("paper_backward", count, count, *shared, pixels, grads)
+
+    share = count / len(field)
+    return (*(median_ms(work, "cuda", 1) / share for work in (forward, both)), share)
+
+
+def paper_on_host(field: Gaussians, view: View, most: float) -> tuple[float, float, float]:
+    """The same by numba on one core, forward only: (ms, 0, share)."""
+    height, width = view.size
+    count = max(1, min(len(field), int(most / (height * width))))
+    some = field[torch.linspace(0, len(field) - 1, count).long()]
+    arrays = [t.numpy() for t in (some.mean, some.std, some.rho, some.peak)]
+    pixels = np.zeros((height, width, 3), np.float32)
+    box = R * (width - 1) / 2, R * (height - 1) / 2
+    share = count / len(field)
+    work = lambda: _paper(*arrays, view.scale[0], *box, pixels)  # noqa: E731
+    return median_ms(work, "cpu", 1) / share, 0.0, share
+
+
+@numba.njit(fastmath=True)
+def _paper(mean, std, rho, peak, scale, box_x, box_y, pixels):
+    for n in range(mean.shape[0]):
+        center_x, center_y = mean[n, 0] * scale - 0.5, mean[n, 1] * scale - 0.5
+        for y in range(pixels.shape[0]):
+            for x in range(pixels.shape[1]):
+                dx, dy = x - center_x, y - center_y
+                if abs(dx) > box_x or abs(dy) > box_y:
+                    continue
+                u, v = dx / (std[n, 0] * scale), dy / (std[n, 1] * scale)
+                q = (u * u - 2 * rho[n] * u * v + v * v) / (1 - rho[n] * rho[n])
+                weight = math.exp(-0.5 * q)
+                for channel in range(3):
+                    pixels[y, x, channel] += weight * peak[n, channel]
+
+
+def machine(device: str) -> str:
+    if device == "cuda":
+        return torch.cuda.get_device_name()
+    model = [
+        line.partition(":")[2].strip()
+        for line in Path("/proc/cpuinfo").read_text().splitlines()
+        if line.startswith("model name")
+    ]
+    return f"{model[0] if model else platform.processor()}, {len(model)} cores"
+
+
+if __name__ == "__main__":
+    main()

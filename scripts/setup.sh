@@ -16,7 +16,8 @@ works() { [ -x $VENV/bin/python ] && $VENV/bin/python -c '' 2>/dev/null; }
 done_already() { recipe | cmp -s - $STAMP && works; }
 
 # Which Debian package brings which library or program. Windows and OpenGL need the first group,
-# rendering without a GPU the Mesa drivers, the tests of the window Xvfb.
+# rendering without a GPU the Mesa drivers, the tests of the window Xvfb, those of the CUDA
+# kernels on machines without a GPU a C++ compiler.
 missing_packages() {
     local libraries name package
     libraries=$(PATH=$PATH:/usr/sbin:/sbin ldconfig -p 2>/dev/null || true)
@@ -39,6 +40,7 @@ missing_packages() {
 	LIST
     command -v Xvfb >/dev/null || echo xvfb
     command -v xauth >/dev/null || echo xauth
+    command -v c++ >/dev/null || command -v clang++ >/dev/null || echo g++
 }
 
 install_packages() { # the names; installs them, or says how

@@ -13,6 +13,8 @@ import pytest
 ROOT = Path(__file__).parent.parent
 
 PROGRAM = """
+from pathlib import Path
+
 import torch
 import gsasr
 from gsasr.files import shipped
@@ -32,6 +34,7 @@ assert picture.shape == (3, 5, 3)
 assert torch.allclose(picture[1, 2], field.color[0])  # the peak lies on that pixel's centre
 for name in ("shaders/gaussian.glsl", "assets/images/astronaut.png"):
     assert shipped(name).is_file(), shipped(name)
+assert (Path(gsasr.__file__).parent / "rasterize" / "kernels.cu").is_file()
 print(gsasr.__file__)
 print(shipped("shaders"))
 """

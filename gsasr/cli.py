@@ -7,6 +7,7 @@ import dataclasses
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +24,7 @@ def main(arguments: list[str] | None = None) -> int:
     if threading.current_thread() is threading.main_thread():
         # As for Ctrl+C: clean up behind a file that is being written.
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    warnings.showwarning = lambda message, *_: print(f"gsasr: {message}", file=sys.stderr)
     try:
         options.run(options)
     except GsasrError as error:
@@ -30,7 +32,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and "allocate memory" not in str(error):
-            raise  # PyTorch's way of saying the same
+            raise  # the other is PyTorch's way of saying the same
         print("gsasr: Not enough memory; use a smaller scale or a region.", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -52,9 +54,18 @@ def upscale(options: argparse.Namespace) -> None:
     view = View.at_scale(picture.size, options.scale)
     require_picture(view.size)
     image.check_output(options.output, view.size, alpha=picture.alpha is not None)
-    model = load_model(options.model)
+    model = load_model(options.model).to(chosen_device(options.device))
     with progress("upscaling") as told:
-        color = upscale(model, picture.color, view, options.condition, options.backend, told)
+        color = upscale(
+            model,
+            picture.color,
+            view,
+            options.condition,
+            options.backend,
+            precision=options.precision,
+            progress=told,
+            **given_tile(options),
+        )
     alpha = None if picture.alpha is None else resample_alpha(picture.alpha, view)
     image.write(options.output, color, like=picture, alpha=alpha)
 
@@ -70,9 +81,16 @@ def predict(options: argparse.Namespace) -> None:
         raise FieldError(f"{options.output} must end in .safetensors.")
     check_writable(options.output, FieldError)
     picture = image.read(options.input)
-    model = load_model(options.model)
+    model = load_model(options.model).to(chosen_device(options.device))
     with progress("predicting") as told:
-        field = predict(model, picture.color, options.scale, progress=told)
+        field = predict(
+            model,
+            picture.color,
+            options.scale,
+            precision=options.precision,
+            progress=told,
+            **given_tile(options),
+        )
     dataclasses.replace(field, source=picture.source).save(options.output)
 
 
@@ -120,6 +138,20 @@ def train(options: argparse.Namespace) -> None:
     }
     config = dataclasses.replace(PRESETS[options.preset], **given)
     print(train(options.preset, options.data, options.out, config, options.valid))
+
+
+def chosen_device(name: str) -> str:
+    """The device for --device; "auto" is a card if PyTorch has one."""
+    import torch
+
+    if name == "cuda" and not torch.cuda.is_available():
+        raise RequestError("PyTorch finds no NVIDIA GPU; use --device cpu.")
+    return ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
+
+
+def given_tile(options: argparse.Namespace) -> dict[str, int]:
+    """--tile as a keyword argument, if it was given."""
+    return {"tile": options.tile} if "tile" in options else {}
 
 
 def chosen_view(
@@ -206,6 +238,23 @@ def parser() -> argparse.ArgumentParser:
     def add_model(command: argparse.ArgumentParser) -> None:
         command.add_argument("--model", default="lite", help="preset name or .safetensors file")
 
+    def add_prediction(command: argparse.ArgumentParser) -> None:
+        command.add_argument(
+            "--precision",
+            choices=("float32", "bfloat16"),
+            default="float32",
+            help="of the network; bfloat16 is faster where the processor has it",
+        )
+        command.add_argument(
+            "--device", choices=("auto", "cpu", "cuda"), default="auto", help="of the network"
+        )
+        command.add_argument(
+            "--tile",
+            type=int,
+            default=argparse.SUPPRESS,
+            help="pixels along the side of a tile, which bounds the memory",
+        )
+
     def add_backend(command: argparse.ArgumentParser) -> None:
         command.add_argument(
             "--backend", choices=("auto", *BACKENDS), default="auto", help="rasterizer"
@@ -222,6 +271,7 @@ def parser() -> argparse.ArgumentParser:
         "--condition", type=positive, help="scale told to the network; default --scale within 1..4"
     )
     add_model(c)
+    add_prediction(c)
     add_backend(c)
 
     c = command(predict, "turn a picture into Gaussians")
@@ -229,6 +279,7 @@ def parser() -> argparse.ArgumentParser:
     add_output(c, "file of Gaussians to write (.safetensors)")
     c.add_argument("--scale", type=positive, default=4.0, help="scale told to the network")
     add_model(c)
+    add_prediction(c)
 
     c = command(render, "draw a file of Gaussians")
     c.add_argument("input", type=Path, help="file of Gaussians")

@@ -13,7 +13,7 @@ from .errors import Cancelled, RequestError
 from .gaussians import Gaussians
 from .memory import require_picture
 from .model import GSASR
-from .predict import predict_tiles
+from .predict import TILE, predict_tiles
 from .rasterize import footprint
 from .rasterize.tiles import split_tiles
 from .view import View
@@ -56,6 +56,8 @@ def upscale(
     view: View,
     condition: float | None = None,
     backend: str = "auto",
+    tile: int = TILE,
+    precision: str = "float32",
     progress: Callable[[float], None] = lambda share: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> np.ndarray:
@@ -63,12 +65,12 @@ def upscale(
 
     Each tile is predicted, drawn and dropped; since a picture is a sum of Gaussians, it is also
     the sum of its tiles. image: (H, W, 3) float32 in [0, 1]. condition: the scale told to the
-    network; by default the view's, within what networks are trained for. progress: told the
-    share done in (0, 1].
+    network; by default the view's, within what networks are trained for. tile, precision: see
+    predict. progress: told the share done in (0, 1].
     """
     if condition is None:
         condition = conditioning_scale(max(view.scale))
-    parts = predict_tiles(model, image, condition, cancelled=cancelled)
+    parts = predict_tiles(model, image, condition, tile, precision, cancelled=cancelled)
     return _sum_of(parts, view, backend, progress, cancelled)
 
 

@@ -9,6 +9,8 @@ keep those a little beyond the edge, which reach inside.
 
 from __future__ import annotations
 
+import warnings
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -24,6 +26,7 @@ TILE = 192  # side of a core, source pixels, rounded to the network's multiple
 HALO = 16  # rounded likewise; what a tile does not see beyond it changes no 8-bit level
 BEYOND = 4  # source pixels past the picture's edge whose Gaussians still reach inside
 SCALES = (0.1, 1000.0)  # conditioning scales that a network can be told
+PRECISIONS = ("float32", "bfloat16")
 
 
 @dataclass(frozen=True)
@@ -44,13 +47,8 @@ def plan(
 ) -> list[Tile]:
     """Tiles of a picture (height, width), nearest to the source point `near` (x, y) first."""
     multiple = model.multiple
-    step = max(multiple, tile // multiple * multiple)
     height, width = (_padded(side, multiple) for side in size)
-    tiles = [
-        Tile(x, y, min(x + step, width), min(y + step, height))
-        for y in range(0, height, step)
-        for x in range(0, width, step)
-    ]
+    tiles = _cut(Tile(0, 0, width, height), max(multiple, tile // multiple * multiple))
     if near is not None:
         tiles.sort(
             key=lambda t: ((t.x0 + t.x1) / 2 - near[0]) ** 2 + ((t.y0 + t.y1) / 2 - near[1]) ** 2
@@ -58,24 +56,39 @@ def plan(
     return tiles
 
 
-@torch.inference_mode()
-def predict_tile(model: GSASR, image: np.ndarray, tile: Tile, scale: float = 4.0) -> Gaussians:
-    """Gaussians of one tile, positioned in the whole picture.
+def _cut(area: Tile, step: int) -> list[Tile]:
+    """The area in tiles of `step` source pixels, those at its right and bottom smaller."""
+    return [
+        Tile(x, y, min(x + step, area.x1), min(y + step, area.y1))
+        for y in range(area.y0, area.y1, step)
+        for x in range(area.x0, area.x1, step)
+    ]
 
-    image: (H, W, 3) float32 in [0, 1], sRGB. scale: conditioning scale, > 0.
+
+@torch.inference_mode()
+def predict_tile(
+    model: GSASR, image: np.ndarray, tile: Tile, scale: float = 4.0, precision: str = "float32"
+) -> Gaussians:
+    """Gaussians of one tile, positioned in the whole picture, on the model's device.
+
+    image: (H, W, 3) float32 in [0, 1], sRGB. scale: conditioning scale, > 0. precision: of the
+    network, "float32" or "bfloat16" (autocast).
     """
     height, width = image.shape[:2]
     multiple = model.multiple
     halo = _padded(HALO, multiple)
     x0, y0, x1, y1 = tile.x0 - halo, tile.y0 - halo, tile.x1 + halo, tile.y1 + halo
     crop = image[_reflected(y0, y1, height)][:, _reflected(x0, x1, width)]
+    # Channels last, which convolutions prefer.
     lr = torch.from_numpy(np.ascontiguousarray(crop, np.float32)).permute(2, 0, 1)[None]
-    raw = model(lr, scale)[0]
-    local = activate(raw, (y1 - y0, x1 - x0))
+    device = next(model.parameters()).device
+    with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
+        raw = model(lr.to(device), scale)[0]
+    local = activate(raw.float(), (y1 - y0, x1 - x0))
     per_pixel = model.config.decoder.seeds * int(np.prod(model.config.decoder.shuffle)) / multiple
     inside_x = _core(x0, x1, tile.x0, tile.x1, width, per_pixel)
     inside_y = _core(y0, y1, tile.y0, tile.y1, height, per_pixel)
-    kept = local[(inside_y[:, None] & inside_x[None, :]).flatten()]
+    kept = local[(inside_y[:, None] & inside_x[None, :]).flatten().to(device)]
     return replace(
         kept,
         mean=kept.mean + kept.mean.new_tensor([x0, y0]),
@@ -90,19 +103,65 @@ def predict_tiles(
     image: np.ndarray,
     scale: float = 4.0,
     tile: int = TILE,
+    precision: str = "float32",
     near: tuple[float, float] | None = None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> Iterator[tuple[Gaussians, float]]:
     """Yield (Gaussians of a tile, share of the picture done in (0, 1]), nearest tiles first.
 
-    Memory is bounded by the tile. cancelled: asked before each tile; Cancelled is raised if true.
+    Memory is bounded by the tile; where there is too little, tiles are halved, then a card is
+    given up for the CPU, with one warning each. cancelled: asked before each tile; Cancelled is
+    raised if true.
     """
-    check(image, scale)
-    tiles = plan(model, image.shape[:2], tile, near)
-    for number, core in enumerate(tiles, start=1):
+    check(image, scale, precision)
+    pending = deque(plan(model, image.shape[:2], tile, near))
+    total = sum(_area(core) for core in pending)
+    done = 0
+    while pending:
         if cancelled():
             raise Cancelled("Prediction was cancelled.")
-        yield predict_tile(model, image, core, scale), number / len(tiles)
+        core = pending.popleft()
+        try:
+            part = predict_tile(model, image, core, scale, precision)
+        except (MemoryError, RuntimeError) as error:
+            if not out_of_memory(error):
+                raise
+            pending.appendleft(core)
+            pending = _easier(model, pending)
+            continue
+        done += _area(core)
+        yield part, done / total
+
+
+def _area(tile: Tile) -> int:
+    return (tile.x1 - tile.x0) * (tile.y1 - tile.y0)
+
+
+def _easier(model: GSASR, pending: deque[Tile]) -> deque[Tile]:
+    """The same tiles at half their size, or, where they are small, with the model on the CPU.
+
+    Raises RequestError if it is there already.
+    """
+    side = max(pending[0].x1 - pending[0].x0, pending[0].y1 - pending[0].y0)
+    half = side // 2 // model.multiple * model.multiple
+    on_card = next(model.parameters()).is_cuda
+    if on_card:
+        torch.cuda.empty_cache()
+    if half >= max(model.multiple, HALO):
+        warnings.warn(f"Out of memory: going on with tiles of {half} pixels.", stacklevel=3)
+        return deque(piece for tile in pending for piece in _cut(tile, half))
+    if not on_card:
+        raise RequestError("There is too little memory for this network; close other programs.")
+    warnings.warn("Out of GPU memory: going on with the CPU.", stacklevel=3)
+    model.to("cpu")
+    return pending
+
+
+def out_of_memory(error: Exception) -> bool:
+    """Whether this is how Python, PyTorch or its CPU allocator say that memory is exhausted."""
+    return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or "allocate memory" in str(
+        error
+    )
 
 
 def predict(
@@ -110,24 +169,28 @@ def predict(
     image: np.ndarray,
     scale: float = 4.0,
     tile: int = TILE,
+    precision: str = "float32",
     progress: Callable[[float], None] = lambda share: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> Gaussians:
-    """All Gaussians of a picture.
+    """All Gaussians of a picture, on the model's device.
 
     image: (H, W, 3) float32 in [0, 1], sRGB; any size from 1x1. scale: conditioning scale, > 0.
-    progress: told the share done after each tile. Raises RequestError for other input.
+    tile: side of a tile, source pixels; bounds the memory. precision: of the network, "float32"
+    or "bfloat16". progress: told the share done after each tile. Raises RequestError for other
+    input.
     """
     require_field(round(image.shape[0] * image.shape[1] * model.config.decoder.gaussians_per_pixel))
     parts = []
-    for part, share in predict_tiles(model, image, scale, tile, cancelled=cancelled):
+    for part, share in predict_tiles(model, image, scale, tile, precision, cancelled=cancelled):
         parts.append(part)
         progress(share)
-    return Gaussians.concatenate(parts)
+    device = parts[-1].mean.device  # the CPU, if memory ran out on a card
+    return Gaussians.concatenate([part.map(lambda tensor: tensor.to(device)) for part in parts])
 
 
-def check(image: np.ndarray, scale: float) -> None:
-    """RequestError unless `image` and `scale` can be predicted from."""
+def check(image: np.ndarray, scale: float, precision: str = "float32") -> None:
+    """RequestError unless `image` can be predicted from, at this scale and precision."""
     if image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise RequestError(f"The picture must have shape (H, W, 3), but has {image.shape}.")
     if not np.issubdtype(image.dtype, np.floating) or not np.isfinite(image).all():
@@ -136,6 +199,8 @@ def check(image: np.ndarray, scale: float) -> None:
         raise RequestError(
             f"The conditioning scale must lie in {SCALES[0]:g}..{SCALES[1]:g}, but is {scale:g}."
         )
+    if precision not in PRECISIONS:
+        raise RequestError(f"Unknown precision {precision!r}; use {' or '.join(PRECISIONS)}.")
 
 
 def _padded(length: int, multiple: int) -> int:

@@ -8,7 +8,7 @@ from gsasr import image
 from gsasr.errors import Cancelled, RequestError
 from gsasr.model import activate, load_model
 from gsasr.picture import conditioning_scale, render, resample_alpha, upscale
-from gsasr.predict import plan, predict, predict_tiles
+from gsasr.predict import PRECISIONS, plan, predict, predict_tile, predict_tiles
 from gsasr.rasterize import reference
 from gsasr.view import View
 
@@ -92,6 +92,63 @@ def test_progress_reaches_the_end_and_cancel_stops_between_tiles(tiny_model):
         next(tiles)
 
 
+def starved(monkeypatch, largest: int, error: Exception) -> list[int]:
+    """Let predict_tile fail for tiles above `largest` pixels; returns the sides it is asked for."""
+    sides, whole = [], predict_tile
+
+    def limited(model, image, tile, *arguments):
+        sides.append(max(tile.x1 - tile.x0, tile.y1 - tile.y0))
+        if sides[-1] > largest:
+            raise error
+        return whole(model, image, tile, *arguments)
+
+    monkeypatch.setattr("gsasr.predict.predict_tile", limited)
+    return sides
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        torch.OutOfMemoryError("CUDA out of memory"),
+        RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 bytes"),
+    ],
+    ids=["python", "card", "cpu"],
+)
+def test_tiles_are_halved_where_memory_runs_out(tiny_model, monkeypatch, error):
+    photo, shares = picture(70, 90), []
+    expected = render(predict(tiny_model, photo, 2.0, tile=16), scale=2, backend="cpu")
+    sides = starved(monkeypatch, 16, error)
+    with pytest.warns(UserWarning, match="Out of memory: going on with tiles of") as told:
+        field = predict(tiny_model, photo, 2.0, tile=64, progress=shares.append)
+    assert [str(w.message).split()[-2] for w in told] == ["32", "16"]
+    assert sides.count(64) == 1 and sides.count(32) == 1
+    assert shares == sorted(shares) and shares[-1] == 1.0
+    assert np.abs(render(field, scale=2, backend="cpu") - expected).max() < 1e-4
+
+
+@pytest.mark.filterwarnings("ignore:Out of memory")
+def test_too_little_memory_for_any_tile_is_one_sentence(tiny_model, monkeypatch):
+    starved(monkeypatch, 0, MemoryError())
+    with pytest.raises(RequestError, match="close other programs"):
+        predict(tiny_model, picture(40, 40), 2.0)
+
+
+def test_other_failures_are_not_taken_for_a_lack_of_memory(tiny_model, monkeypatch):
+    starved(monkeypatch, 0, RuntimeError("shapes do not match"))
+    with pytest.raises(RuntimeError, match="shapes do not match"):
+        predict(tiny_model, picture(40, 40), 2.0)
+
+
+def test_bfloat16_costs_less_than_an_8_bit_level_with_the_shipped_model(images):
+    photo = image.read(images / "cat.png").color[40:136, 60:156]
+    exact, rough = (
+        render(predict(load_model("lite"), photo, 2.0, precision=p), scale=2, backend="cpu")
+        for p in PRECISIONS
+    )
+    assert 0 < np.abs(exact - rough).mean() < 1 / 255
+
+
 def test_what_cannot_be_predicted_is_refused(tiny_model):
     for wrong, scale in (
         (np.zeros((4, 4)), 2.0),
@@ -104,6 +161,8 @@ def test_what_cannot_be_predicted_is_refused(tiny_model):
     ):
         with pytest.raises(RequestError):
             predict(tiny_model, wrong, scale)
+    with pytest.raises(RequestError, match="Unknown precision 'half'; use float32 or bfloat16"):
+        predict(tiny_model, picture(4, 4), precision="half")
 
 
 def test_drawing_tile_by_tile_equals_drawing_the_whole_field(tiny_model):

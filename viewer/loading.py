@@ -122,7 +122,15 @@ class Loader:
         from gsasr.picture import upscale
 
         image = document.picture.color
-        return upscale(model, image, view, condition, "cpu", task.progress, task.cancelled)
+        return upscale(
+            model,
+            image,
+            view,
+            condition,
+            backend="cpu",
+            progress=task.progress,
+            cancelled=task.cancelled,
+        )
 
     def _load(self, name: str) -> GSASR:
         import torch

@@ -121,4 +121,4 @@ class MLP(nn.Module):
         self.fc2 = nn.Linear(dim, dim)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return self.fc2(torch.relu(self.fc1(x)))
+        return self.fc2(self.fc1(x).relu_())

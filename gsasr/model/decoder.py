@@ -20,6 +20,8 @@ from .attention import MLP, ScaleAttention, WindowAttention, from_windows, to_wi
 
 HEADS = {"sigma": 2, "rho": 1, "alpha": 1, "rgb": 3, "mean": 2}  # name -> columns, in raw order
 
+CACHED = 1024  # tokens whose hidden layers in a head fit in a processor's cache
+
 
 @dataclass(frozen=True)
 class DecoderConfig:
@@ -103,13 +105,17 @@ class GaussianDecoder(nn.Module):
     def _read(self, fine: torch.Tensor) -> torch.Tensor:
         """(B, Gy, Gx, C) tokens of the fine grid -> (B, Gy * Gx, 9) raw columns."""
         rows, columns = fine.shape[1:3]
-        *activations, offset = (self.get_submodule(f"mlp_block_{name}")(fine) for name in HEADS)
+        heads = [self.get_submodule(f"mlp_block_{name}") for name in HEADS]
+        # A few rows at a time, so that hidden layers stay in the cache; autograd keeps all anyway.
+        some = rows if torch.is_grad_enabled() else max(1, CACHED // columns)
+        parts = [torch.cat([head(part) for head in heads], -1) for part in fine.split(some, dim=1)]
+        activations, offset = torch.cat(parts, dim=1).split((7, 2), dim=-1)
         x = torch.arange(columns, device=fine.device) + 0.5
         y = torch.arange(rows, device=fine.device) + 0.5
         cells = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)  # [Gy, Gx, 2]
         extent = cells.new_tensor([columns, rows])
         mean = offset / extent + cells / extent
-        return torch.cat([*activations, mean], dim=-1).flatten(1, 2)
+        return torch.cat([activations, mean], dim=-1).flatten(1, 2)
 
     def initialise(self) -> None:
         """Start with small, grey, overlapping Gaussians whose opacities sum to mid-grey."""
@@ -150,11 +156,16 @@ class GaussianDecoder(nn.Module):
 def head(dim: int, hidden: int, columns: int) -> nn.Sequential:
     return nn.Sequential(
         nn.Linear(dim, dim),
-        nn.ReLU(),
+        nn.ReLU(inplace=True),
         nn.Linear(dim, hidden),
-        nn.ReLU(),
+        nn.ReLU(inplace=True),
         nn.Linear(hidden, columns),
     )
+
+
+def unused(layer: nn.Module) -> nn.Module:
+    """A layer that only feeds the query that does not matter: kept for checkpoints, not trained."""
+    return layer.requires_grad_(False)
 
 
 class CrossBlock(nn.Module):
@@ -182,7 +193,7 @@ class CrossLayer(nn.Module):
         dim = config.channels
         self.window, self.seeds = config.window, config.seeds
         self.shift = config.window // 2 if shifted else 0
-        self.norm1 = nn.LayerNorm(dim)  # only feeds the query that does not matter
+        self.norm1 = unused(nn.LayerNorm(dim))
         self.norm2 = nn.LayerNorm(dim)
         self.norm3 = nn.LayerNorm(dim)
         self.norm4 = nn.LayerNorm(dim)
@@ -232,7 +243,7 @@ class SelfLayer(nn.Module):
         self.shift = config.seeds // 2 if shifted else 0
         self.norm1 = nn.LayerNorm(dim)
         self.norm2 = nn.LayerNorm(dim)
-        self.norm3 = nn.LayerNorm(dim)  # only feeds the query that does not matter
+        self.norm3 = unused(nn.LayerNorm(dim))
         self.norm4 = nn.LayerNorm(dim)
         self.gs_self_attn = WindowAttention(dim, config.heads, config.seeds, config.seeds)
         self.mlp_selfattn = MLP(dim)

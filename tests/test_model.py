@@ -15,9 +15,14 @@ from gsasr.rasterize import reference
 from gsasr.view import View
 
 
-@pytest.fixture(scope="module")
-def paper(golden):
-    return load_file(golden / "edsr_paper.safetensors")
+FAMILIES = ("edsr_paper", "edsr_enhanced")
+
+
+@pytest.fixture(params=FAMILIES)
+def released(request, golden):
+    """A tiny network of each family and what the released code makes of its input."""
+    path = golden / f"{request.param}.safetensors"
+    return load_model(path), load_file(path)
 
 
 @pytest.fixture(scope="module")
@@ -25,16 +30,18 @@ def paper_model(golden):
     return load_model(golden / "edsr_paper.safetensors")
 
 
-def test_features_equal_those_of_the_released_code(paper, paper_model):
+def test_features_equal_those_of_the_released_code(released):
+    model, tensors = released
     with torch.inference_mode():
-        features = paper_model.encode(paper["io.lr"])
-    torch.testing.assert_close(features, paper["io.features"], atol=1e-5, rtol=0)
+        features = model.encode(tensors["io.lr"])
+    torch.testing.assert_close(features, tensors["io.features"], atol=1e-5, rtol=0)
 
 
-def test_raw_gaussians_equal_those_of_the_released_code(paper, paper_model):
+def test_raw_gaussians_equal_those_of_the_released_code(released):
+    model, tensors = released
     with torch.inference_mode():
-        raw = paper_model.decode(paper["io.features"], paper["io.scale"])
-    torch.testing.assert_close(raw, paper["io.raw"], atol=1e-5, rtol=0)
+        raw = model.decode(tensors["io.features"], tensors["io.scale"])
+    torch.testing.assert_close(raw, tensors["io.raw"], atol=1e-5, rtol=0)
 
 
 def test_hyper_parameters_are_deduced_from_the_tensors(paper_model):
@@ -54,7 +61,7 @@ def test_full_size_preset_matches_the_released_manifest_key_for_key(golden):
         model = GSASR(PRESETS["edsr-baseline"])
     for part in ("encoder", "decoder"):
         ours = {k: list(v.shape) for k, v in model.get_submodule(part).state_dict().items()}
-        released = {k: v["shape"] for k, v in manifest[part]["state_dict"].items()}
+        released = manifest[part]
         assert ours == released
 
 

@@ -1,4 +1,4 @@
-"""Window attention of the Gaussian decoder.
+"""Window attention: the Gaussian decoder's, and the core of the encoders'.
 
 Tokens live on a grid (B, H, W, C) all the way, so a shifted window is a roll of the grid. Attribute
 names follow the released checkpoints, whose tensors load by key.
@@ -7,10 +7,13 @@ names follow the released checkpoints, whose tensors load by key.
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
 from torch import nn
+
+Position = Literal["bias", "rotary"]
 
 
 def to_windows(grid: torch.Tensor, side: int) -> torch.Tensor:
@@ -27,49 +30,145 @@ def from_windows(windows: torch.Tensor, side: int, height: int, width: int) -> t
     return grid.reshape(-1, height, width, c)
 
 
-class WindowAttention(nn.Module):
-    """Multi-head attention of the queries of one window to its keys, with a learned position bias.
+class Attention(nn.Module):
+    """Multi-head attention of the queries of one window to its keys. Subclasses project.
 
     query_side, key_side: tokens along one side of a window of queries and of keys.
+    position: how attention knows where tokens are. "bias": a learned number per head and offset is
+        added to the logits. "rotary": queries and keys are turned by learned angles per position.
     """
 
-    def __init__(self, dim: int, heads: int, query_side: int, key_side: int) -> None:
+    def __init__(
+        self, dim: int, heads: int, query_side: int, key_side: int, position: Position
+    ) -> None:
         super().__init__()
         self.heads = heads
+        self.position = position
+        self.aligned = query_side == key_side  # token i of both lies at the same place
+        self.proj = nn.Linear(dim, dim)
+        finer = max(query_side, key_side)
+        if position == "bias":
+            table = torch.empty((2 * finer - 1) ** 2, heads)
+            self.relative_position_bias_table = nn.Parameter(nn.init.trunc_normal_(table, std=0.02))
+            self.register_buffer(
+                "relative_position_index", relative_position_index(query_side, key_side)
+            )
+        else:
+            # Row by row on the finer grid. The coarser one takes the first of these positions,
+            # wherever its tokens are: the released weights were trained so.
+            self.rope_freqs = nn.Parameter(rotary_frequencies(heads, dim // heads))
+            self.register_buffer("rope_t_x", torch.arange(finer).repeat(finer).float())
+            self.register_buffer("rope_t_y", torch.arange(finer).repeat_interleave(finer).float())
+
+    def attend(
+        self,
+        queries: torch.Tensor,
+        keys: torch.Tensor,
+        values: torch.Tensor,
+        mask: torch.Tensor | None = None,
+    ) -> torch.Tensor:
+        """(windows, Nq, C) queries, (windows, Nk, C) keys and values -> (windows, Nq, C).
+
+        mask: (windows of a picture, Nq, Nk), added to the logits; only with position "bias".
+        """
+        q, k, v = (
+            x.unflatten(-1, (self.heads, -1)).transpose(1, 2)  # [windows, heads, N, C/heads]
+            for x in (queries, keys, values)
+        )
+        if self.position == "rotary":
+            angles = self._angles()
+            mixed = F.scaled_dot_product_attention(turned(q, angles), turned(k, angles), v)
+        else:
+            # Windows are small, so plain products; the library's attention guards against rows
+            # that are masked out, which costs a tenth of a training step and cannot happen here.
+            logits = (q * q.shape[-1] ** -0.5) @ k.transpose(-2, -1) + self._bias()
+            if mask is not None:
+                logits = (logits.unflatten(0, (-1, len(mask))) + mask[:, None]).flatten(0, 1)
+            mixed = logits.softmax(dim=-1).to(v.dtype) @ v
+        return self.proj(mixed.transpose(1, 2).flatten(2))
+
+    def _bias(self) -> torch.Tensor:
+        """(heads, Nq, Nk)"""
+        bias = self.relative_position_bias_table[self.relative_position_index]
+        return bias.permute(2, 0, 1)
+
+    def _angles(self) -> torch.Tensor:
+        """(heads, positions, C/heads/2) radians, in float32 whatever the network computes in."""
+        along_x, along_y = self.rope_freqs.float()[:, :, None]  # [heads, 1, C/heads/2]
+        return self.rope_t_x[:, None] * along_x + self.rope_t_y[:, None] * along_y
+
+
+class WindowAttention(Attention):
+    """Attention of the Gaussian decoder: queries, keys and values are projected apart."""
+
+    def __init__(
+        self, dim: int, heads: int, query_side: int, key_side: int, position: Position = "bias"
+    ) -> None:
+        super().__init__(dim, heads, query_side, key_side, position)
         self.qhead = nn.Linear(dim, dim)
         self.khead = nn.Linear(dim, dim)
         self.vhead = nn.Linear(dim, dim)
-        self.proj = nn.Linear(dim, dim)
-        table = (2 * max(query_side, key_side) - 1) ** 2
-        self.relative_position_bias_table = nn.Parameter(torch.empty(table, heads))
-        nn.init.trunc_normal_(self.relative_position_bias_table, std=0.02)
-        self.register_buffer(
-            "relative_position_index", relative_position_index(query_side, key_side)
-        )
 
     def look_at_own_position(self) -> None:
         """Start with each query looking mostly at the keys under it, not at the window's mean.
 
         Without it the first thousand steps of training go into finding this out.
         """
-        finer = math.isqrt(self.relative_position_bias_table.shape[0]) // 2 + 1
-        no_offset = (finer - 1) * (2 * finer - 1) + finer - 1
         with torch.no_grad():
-            keys = self.relative_position_index.shape[1]
-            self.relative_position_bias_table[no_offset] = math.log(keys)
+            if self.position == "bias":
+                keys = self.relative_position_index.shape[1]
+                finer = math.isqrt(self.relative_position_bias_table.shape[0]) // 2 + 1
+                no_offset = (finer - 1) * (2 * finer - 1) + finer - 1
+                self.relative_position_bias_table[no_offset] = math.log(keys)
+            elif self.aligned:
+                # Equal biases, turned by position, agree best where the positions are equal: their
+                # product adds 2 log(keys) to the logit there, and less the further away.
+                keys, width = len(self.rope_t_x), self.khead.out_features // self.heads
+                both = math.sqrt(2 * math.log(keys) / width**0.5)
+                self.qhead.bias.fill_(both)
+                self.khead.bias.fill_(both)
 
     def forward(self, queries: torch.Tensor, tokens: torch.Tensor) -> torch.Tensor:
         """(windows, Nq, C) queries over (windows, Nk, C) tokens -> (windows, Nq, C)."""
-        q, k, v = (
-            head(x).unflatten(-1, (self.heads, -1)).transpose(1, 2)  # [windows, heads, N, C/heads]
-            for head, x in ((self.qhead, queries), (self.khead, tokens), (self.vhead, tokens))
-        )
-        bias = self.relative_position_bias_table[self.relative_position_index]  # [Nq, Nk, heads]
-        # Windows are small, so plain products; the library's attention guards against rows
-        # that are masked out, which costs a tenth of a training step and cannot happen here.
-        logits = (q * q.shape[-1] ** -0.5) @ k.transpose(-2, -1) + bias.permute(2, 0, 1)
-        mixed = logits.softmax(dim=-1).to(v.dtype) @ v
-        return self.proj(mixed.transpose(1, 2).flatten(2))
+        return self.attend(self.qhead(queries), self.khead(tokens), self.vhead(tokens))
+
+
+class SelfAttention(Attention):
+    """Attention of the encoders: tokens of a window to each other, projected at once."""
+
+    def __init__(self, dim: int, heads: int, side: int, position: Position) -> None:
+        super().__init__(dim, heads, side, side, position)
+        self.qkv = nn.Linear(dim, 3 * dim)
+
+    def forward(self, tokens: torch.Tensor, mask: torch.Tensor | None = None) -> torch.Tensor:
+        """(windows, N, C) -> the same. mask: see `attend`."""
+        return self.attend(*self.qkv(tokens).chunk(3, dim=-1), mask)
+
+
+def turned(x: torch.Tensor, angles: torch.Tensor) -> torch.Tensor:
+    """(windows, heads, N, C) with each pair of neighbouring channels turned as a point of a plane.
+
+    angles: (heads, N or more, C/2) radians; the first N are used.
+    """
+    first, second = x.float().unflatten(-1, (-1, 2)).unbind(-1)
+    angles = angles[:, : x.shape[2]]
+    cos, sin = angles.cos(), angles.sin()
+    both = torch.stack((first * cos - second * sin, first * sin + second * cos), dim=-1)
+    return both.flatten(-2).type_as(x)
+
+
+def rotary_frequencies(heads: int, width: int) -> torch.Tensor:
+    """(2, heads, width/2) radians per token along x and y, to start training from.
+
+    Each head has a pair of perpendicular directions of its own, at random, and looks along both in
+    wavelengths that grow from pair to pair by a power of 10, as in RoPE-Mixed (arXiv 2403.13298).
+    """
+    pairs = width // 2
+    along = torch.arange(pairs) < (pairs + 1) // 2  # the first half along one direction
+    step = torch.arange(pairs) % max(1, (pairs + 1) // 2)
+    rate = 10.0 ** (-4.0 * step / width)
+    direction = 2 * math.pi * torch.rand(heads, 1) + torch.where(along, 0.0, math.pi / 2)
+    return torch.stack((rate * direction.cos(), rate * direction.sin()))
 
 
 def relative_position_index(query_side: int, key_side: int) -> torch.Tensor:
@@ -115,6 +214,8 @@ class ScaleAttention(nn.Module):
 
 
 class MLP(nn.Module):
+    """Two layers with a ReLU between."""
+
     def __init__(self, dim: int) -> None:
         super().__init__()
         self.fc1 = nn.Linear(dim, dim)

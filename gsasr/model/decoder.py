@@ -4,6 +4,9 @@ Each window of the feature map gets a grid of learned Gaussian embeddings. Condi
 (window cross-attention) tells them what the picture shows there, Gaussian interaction blocks
 (window self-attention) let them talk, pixel shuffling multiplies them, and five heads read off
 opacity, colour, standard deviation, offset and correlation. Every layer also adds the scale.
+
+There are two kinds: the paper's, with a position bias in its attention, and the enhanced one of the
+supplementary, with rotary positions and a convolution at the end of each block and of all blocks.
 Attribute names follow the released checkpoints.
 """
 
@@ -16,7 +19,15 @@ import torch
 from torch import nn
 
 from ..errors import RequestError
-from .attention import MLP, ScaleAttention, WindowAttention, from_windows, to_windows
+from .attention import (
+    MLP,
+    Position,
+    ScaleAttention,
+    WindowAttention,
+    from_windows,
+    to_windows,
+)
+from .state import State, count, side
 
 HEADS = {"sigma": 2, "rho": 1, "alpha": 1, "rgb": 3, "mean": 2}  # name -> columns, in raw order
 
@@ -35,6 +46,7 @@ class DecoderConfig:
     self_blocks, self_layers: L interaction blocks, layers in each.
     shuffle: up-sampling factors of the two pixel shuffles; m = (seeds/window * product)^2.
     head_expansion: width of the hidden layer of the five heads, in units of channels.
+    position: how attention encodes position; "bias": the paper's decoder, "rotary": the enhanced.
     """
 
     channels: int = 180
@@ -47,11 +59,29 @@ class DecoderConfig:
     self_layers: int = 6
     shuffle: tuple[int, int] = (2, 2)
     head_expansion: int = 4
+    position: Position = "bias"
+
+    def __post_init__(self) -> None:
+        if self.channels % self.heads or (self.enhanced and self.channels // self.heads % 2):
+            raise ValueError("channels must be a multiple of heads, and of 2 heads if enhanced")
+
+    @property
+    def enhanced(self) -> bool:
+        """Whether this is the enhanced decoder rather than the paper's."""
+        return self.position == "rotary"
 
     @property
     def gaussians_per_pixel(self) -> float:
         """m of the paper."""
         return (self.seeds / self.window * self.shuffle[0] * self.shuffle[1]) ** 2
+
+    def __str__(self) -> str:
+        return (
+            f"{'enhanced' if self.enhanced else 'paper'}, {self.channels} channels, "
+            f"{self.heads} heads, window {self.window}, {self.seeds}x{self.seeds} seeds, "
+            f"{self.cross_blocks}x{self.cross_layers} injection and "
+            f"{self.self_blocks}x{self.self_layers} interaction layers"
+        )
 
 
 class GaussianDecoder(nn.Module):
@@ -65,9 +95,13 @@ class GaussianDecoder(nn.Module):
             nn.Conv2d(in_channels, dim, 3, padding=1), nn.ReLU(), nn.Conv2d(dim, dim, 3, padding=1)
         )
         self.window_crossattn_blocks = nn.ModuleList(
-            CrossBlock(config) for _ in range(c.cross_blocks)
+            Block(config, CrossLayer, c.cross_layers) for _ in range(c.cross_blocks)
         )
-        self.gs_selfattn_blocks = nn.ModuleList(SelfBlock(config) for _ in range(c.self_blocks))
+        self.gs_selfattn_blocks = nn.ModuleList(
+            Block(config, SelfLayer, c.self_layers) for _ in range(c.self_blocks)
+        )
+        if config.enhanced:
+            self.conv_final = nn.Conv2d(dim, dim, 3, padding=1)
         self.scale_mlp = nn.Sequential(nn.Linear(1, 4 * dim), nn.ReLU(), nn.Linear(4 * dim, dim))
         self.UPNet = nn.Sequential(
             nn.Conv2d(dim, dim * c.shuffle[0] ** 2, 3, padding=1),
@@ -99,6 +133,8 @@ class GaussianDecoder(nn.Module):
         injected = tokens
         for block in self.gs_selfattn_blocks:
             tokens = block(tokens, embedding)
+        if self.config.enhanced:
+            tokens = on_grid(self.conv_final, tokens)
         fine = self.UPNet((tokens + injected).permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
         return self._read(fine)
 
@@ -127,29 +163,40 @@ class GaussianDecoder(nn.Module):
                 last = self.get_submodule(f"mlp_block_{name}")[4]
                 last.weight.mul_(0.3 if name == "rgb" else 0.1)
             self.get_submodule("mlp_block_alpha")[4].bias.fill_(math.log(share / (1 - share)))
+        for block in self.window_crossattn_blocks:
+            for layer in block.blocks:
+                if not layer.shift:
+                    layer.window_cross_attn.look_at_own_position()
 
     @staticmethod
-    def config_from(state: dict[str, torch.Tensor]) -> DecoderConfig:
-        """The configuration that has tensors of these shapes."""
+    def config_from(state: State) -> DecoderConfig:
+        """The configuration that has tensors of these shapes.
 
-        def count(prefix: str) -> int:
-            start = prefix.count(".") + 1
-            return 1 + max(int(k.split(".")[start]) for k in state if k.startswith(prefix + "."))
-
+        Of the window, rotary attention stores nothing where it is smaller than the seeds' grid;
+        then the window is taken to be as wide as that. Raises KeyError, ValueError.
+        """
         cross, own = "window_crossattn_blocks", "gs_selfattn_blocks"
-        index = state[f"{cross}.0.blocks.0.window_cross_attn.relative_position_index"]
         dim = state["gs_embedding"].shape[1]
+        seeds = side(len(state["gs_embedding"]))
+        attention = f"{cross}.0.blocks.0.window_cross_attn"
+        if f"{attention}.rope_freqs" in state:
+            position, heads = "rotary", state[f"{attention}.rope_freqs"].shape[1]
+            window = side(len(state[f"{attention}.rope_t_x"]))
+        else:
+            position, heads = "bias", state[f"{attention}.relative_position_bias_table"].shape[1]
+            window = side(state[f"{attention}.relative_position_index"].shape[1])
         return DecoderConfig(
             channels=dim,
-            heads=state[f"{own}.0.blocks.0.gs_self_attn.relative_position_bias_table"].shape[1],
-            window=math.isqrt(index.shape[1]),
-            seeds=math.isqrt(index.shape[0]),
-            cross_blocks=count(cross),
-            cross_layers=count(f"{cross}.0.blocks"),
-            self_blocks=count(own),
-            self_layers=count(f"{own}.0.blocks"),
-            shuffle=tuple(math.isqrt(state[f"UPNet.{i}.weight"].shape[0] // dim) for i in (0, 2)),
-            head_expansion=state["mlp_block_sigma.2.weight"].shape[0] // dim,
+            heads=heads,
+            window=window,
+            seeds=seeds,
+            cross_blocks=count(state, cross),
+            cross_layers=count(state, f"{cross}.0.blocks"),
+            self_blocks=count(state, own),
+            self_layers=count(state, f"{own}.0.blocks"),
+            shuffle=tuple(side(len(state[f"UPNet.{i}.weight"]) // dim) for i in (0, 2)),
+            head_expansion=len(state["mlp_block_sigma.2.weight"]) // dim,
+            position=position,
         )
 
 
@@ -168,26 +215,37 @@ def unused(layer: nn.Module) -> nn.Module:
     return layer.requires_grad_(False)
 
 
-class CrossBlock(nn.Module):
-    """Condition injection: Gaussian tokens look at the features of their window."""
+def on_grid(conv: nn.Conv2d, tokens: torch.Tensor) -> torch.Tensor:
+    """A convolution over tokens (B, H, W, C)."""
+    return conv(tokens.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
 
-    def __init__(self, config: DecoderConfig) -> None:
+
+class Block(nn.Module):
+    """Layers, every second one over shifted windows, then an MLP, around a residual connection.
+
+    layer: CrossLayer or SelfLayer.
+    """
+
+    def __init__(self, config: DecoderConfig, layer: type[nn.Module], layers: int) -> None:
         super().__init__()
         dim = config.channels
         self.mlp = nn.Sequential(nn.Linear(dim, dim), nn.ReLU(), nn.Linear(dim, dim))
         self.norm = nn.LayerNorm(dim)
-        self.blocks = nn.ModuleList(
-            CrossLayer(config, shifted=i % 2 == 1) for i in range(config.cross_layers)
-        )
+        self.blocks = nn.ModuleList(layer(config, shifted=i % 2 == 1) for i in range(layers))
+        self.conv = nn.Conv2d(dim, dim, 3, padding=1) if config.enhanced else None
 
-    def forward(self, tokens, positions, guide, embedding):
+    def forward(self, tokens: torch.Tensor, *context: torch.Tensor) -> torch.Tensor:
+        """(B, H, W, C) tokens -> the same. context: whatever else the layers look at."""
         x = self.norm(tokens)
         for layer in self.blocks:
-            x = layer(x, positions, guide, embedding)
-        return tokens + self.mlp(x)
+            x = layer(x, *context)
+        x = self.mlp(x)
+        return tokens + (on_grid(self.conv, x) if self.conv else x)
 
 
 class CrossLayer(nn.Module):
+    """Condition injection: Gaussian tokens look at the features of their window."""
+
     def __init__(self, config: DecoderConfig, shifted: bool) -> None:
         super().__init__()
         dim = config.channels
@@ -198,9 +256,9 @@ class CrossLayer(nn.Module):
         self.norm3 = nn.LayerNorm(dim)
         self.norm4 = nn.LayerNorm(dim)
         self.gs_cross_attn_scale = ScaleAttention(dim)
-        self.window_cross_attn = WindowAttention(dim, config.heads, config.seeds, config.window)
-        if not shifted:
-            self.window_cross_attn.look_at_own_position()
+        self.window_cross_attn = WindowAttention(
+            dim, config.heads, config.seeds, config.window, config.position
+        )
         self.mlp_crossattn_scale = MLP(dim)
         self.mlp_crossattn_feature = MLP(dim)
 
@@ -216,26 +274,9 @@ class CrossLayer(nn.Module):
         return x + self.mlp_crossattn_feature(self.norm4(x))
 
 
-class SelfBlock(nn.Module):
-    """Gaussian interaction: tokens of a window, then of shifted windows, attend to each other."""
-
-    def __init__(self, config: DecoderConfig) -> None:
-        super().__init__()
-        dim = config.channels
-        self.mlp = nn.Sequential(nn.Linear(dim, dim), nn.ReLU(), nn.Linear(dim, dim))
-        self.norm = nn.LayerNorm(dim)
-        self.blocks = nn.ModuleList(
-            SelfLayer(config, shifted=i % 2 == 1) for i in range(config.self_layers)
-        )
-
-    def forward(self, tokens, embedding):
-        x = self.norm(tokens)
-        for layer in self.blocks:
-            x = layer(x, embedding)
-        return tokens + self.mlp(x)
-
-
 class SelfLayer(nn.Module):
+    """Gaussian interaction: tokens of a window attend to each other."""
+
     def __init__(self, config: DecoderConfig, shifted: bool) -> None:
         super().__init__()
         dim = config.channels
@@ -245,7 +286,9 @@ class SelfLayer(nn.Module):
         self.norm2 = nn.LayerNorm(dim)
         self.norm3 = unused(nn.LayerNorm(dim))
         self.norm4 = nn.LayerNorm(dim)
-        self.gs_self_attn = WindowAttention(dim, config.heads, config.seeds, config.seeds)
+        self.gs_self_attn = WindowAttention(
+            dim, config.heads, config.seeds, config.seeds, config.position
+        )
         self.mlp_selfattn = MLP(dim)
         self.gs_cross_attn_scale = ScaleAttention(dim)
         self.mlp_crossattn = MLP(dim)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import math
-import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -116,8 +115,7 @@ class GlRasterizer:
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self.ctx = ctx
-        software = any(name in ctx.info["GL_RENDERER"].lower() for name in SOFTWARE)
-        self._shapes = SOFTWARE_SHAPES if software else HARDWARE_SHAPES
+        self._shapes = SOFTWARE_SHAPES if software(ctx.info) else HARDWARE_SHAPES
         self._programs: dict[tuple[Shape, str], moderngl.ComputeShader] = {}
         self._runs: dict[tuple[float, Shape], moderngl.Buffer] = {}
 
@@ -332,24 +330,33 @@ def create_context() -> moderngl.Context:
 
 
 @functools.cache
-def hardware() -> bool:
-    """Whether a headless OpenGL 4.3 device is here that is no software renderer. Never raises."""
-    found = False
+def driver() -> dict:
+    """What a headless context says of itself, by OpenGL's names. Raises BackendError if none."""
+    # On a thread of its own, as a new context would displace the caller's.
+    with ThreadPoolExecutor(1, thread_name_prefix="gl-probe") as thread:
+        return thread.submit(_ask_driver).result()
 
-    def probe() -> None:
-        nonlocal found
-        try:
-            ctx = create_context()
-        except BackendError:
-            return
-        found = not any(name in ctx.info["GL_RENDERER"].lower() for name in SOFTWARE)
+
+def _ask_driver() -> dict:
+    ctx = create_context()
+    try:
+        return dict(ctx.info)
+    finally:
         ctx.release()
 
-    # On a thread of its own, as a new context would displace the caller's.
-    thread = threading.Thread(target=probe, name="gl-probe")
-    thread.start()
-    thread.join()
-    return found
+
+def software(info: dict) -> bool:
+    """Whether a context with this `info` draws on the CPU."""
+    return any(name in info["GL_RENDERER"].lower() for name in SOFTWARE)
+
+
+@functools.cache
+def hardware() -> bool:
+    """Whether a headless OpenGL 4.3 device is here that is no software renderer. Never raises."""
+    try:
+        return not software(driver())
+    except BackendError:
+        return False
 
 
 def render(gaussians: Gaussians, view: View, quality: str = "export") -> np.ndarray:

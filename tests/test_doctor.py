@@ -1,0 +1,62 @@
+"""`gsasr doctor` says what there is, and what to do about what is missing."""
+
+import pytest
+
+from gsasr import doctor
+from gsasr.errors import BackendError
+from gsasr.rasterize import gl, nvrtc
+
+
+def findings() -> dict[str, doctor.Finding]:
+    return {finding.name: finding for finding in doctor.examine()}
+
+
+def test_everything_that_is_here_is_named_with_its_version():
+    import numba
+    import torch
+
+    found = findings()
+    assert torch.__version__ in found["PyTorch"].value
+    assert numba.__version__ in found["numba"].value
+    assert {"gsasr", "system", "OpenGL", "NVRTC"} <= found.keys()
+
+
+def test_the_limits_of_opengl_are_asked_of_the_driver(gl_context):
+    found = findings()
+    assert gl_context.info["GL_RENDERER"] in found["OpenGL"].value
+    assert f"{gl_context.info['GL_MAX_TEXTURE_SIZE']:,} pixels" in found["OpenGL limits"].value
+
+
+def test_what_is_missing_comes_with_advice(monkeypatch):
+    def missing(*_):
+        raise BackendError("Not here; install it.")
+
+    monkeypatch.setattr(gl, "driver", missing)
+    monkeypatch.setattr(nvrtc, "supported", missing)
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 0)
+    monkeypatch.setattr("platform.system", lambda: "Linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    found = findings()
+    assert found["OpenGL"].advice == found["NVRTC"].advice == "Not here; install it."
+    assert "OpenGL limits" not in found
+    assert "--snapshot" in found["display"].advice
+
+
+def test_the_report_has_a_line_each_and_advice_below(monkeypatch, capsys):
+    two = [doctor.Finding("one", "fine"), doctor.Finding("two", "none", "get one")]
+    monkeypatch.setattr(doctor, "examine", lambda: iter(two))
+    doctor.report()
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split() for line in lines] == [
+        ["one:", "fine"],
+        ["two:", "none"],
+        ["->", "get", "one"],
+    ]
+
+
+@pytest.mark.parametrize("renderer", ["llvmpipe (LLVM 15)", "softpipe", "SwiftShader Device"])
+def test_software_renderers_are_told_from_hardware(renderer):
+    assert gl.software({"GL_RENDERER": renderer})
+    assert not gl.software({"GL_RENDERER": "NVIDIA H200/PCIe/SSE2"})

@@ -14,8 +14,7 @@ from gsasr.model.checkpoint import build
 from gsasr.rasterize import reference
 from gsasr.view import View
 
-
-FAMILIES = ("edsr_paper", "edsr_enhanced")
+FAMILIES = ("edsr_paper", "edsr_enhanced", "rdn_paper", "swinir_paper", "hatl_ultra")
 
 
 @pytest.fixture(params=FAMILIES)
@@ -55,14 +54,35 @@ def test_hyper_parameters_are_deduced_from_the_tensors(paper_model):
     assert decoder.gaussians_per_pixel == 16
 
 
-def test_full_size_preset_matches_the_released_manifest_key_for_key(golden):
-    manifest = json.loads((golden / "manifest_edsr_paper.json").read_text())
+MANIFESTS = {
+    "edsr-baseline": "edsr_paper",
+    "edsr-paper": "edsr_paper",
+    "rdn-paper": "rdn_paper",
+    "swinir-paper": "swinir_paper",
+    "edsr-div2k": "edsr_enhanced",
+    "edsr-df2k": "edsr_enhanced",
+    "rdn-div2k": "rdn_enhanced",
+    "rdn-df2k": "rdn_enhanced",
+    "swinir-div2k": "swinir_enhanced",
+    "swinir-df2k": "swinir_enhanced",
+    "hatl-sa1b": "hatl_ultra",
+}
+
+
+@pytest.mark.parametrize("preset", sorted(PRESETS.keys() - {"lite"}))
+def test_full_size_presets_match_the_released_manifests_key_for_key(golden, preset):
+    manifest = json.loads((golden / f"manifest_{MANIFESTS[preset]}.json").read_text())
     with torch.device("meta"):
-        model = GSASR(PRESETS["edsr-baseline"])
+        model = GSASR(PRESETS[preset])
     for part in ("encoder", "decoder"):
-        ours = {k: list(v.shape) for k, v in model.get_submodule(part).state_dict().items()}
-        released = manifest[part]
-        assert ours == released
+        ours = model.get_submodule(part).state_dict()
+        assert {k: list(v.shape) for k, v in ours.items()} == manifest[part]
+        parameters = sum(p.numel() for p in model.get_submodule(part).parameters())
+        assert parameters == manifest["parameters"][part]
+    buffers = {k: str(v.dtype).removeprefix("torch.") for k, v in model.named_buffers()}
+    assert buffers == manifest["buffers"]
+    assert model.multiple == manifest["input_multiple"]
+    assert model.config.decoder.gaussians_per_pixel == manifest["gaussians_per_lr_pixel"]
 
 
 @pytest.mark.parametrize(("case", "scale"), [(1, 4), (5, 1)])

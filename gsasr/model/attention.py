@@ -30,6 +30,11 @@ def from_windows(windows: torch.Tensor, side: int, height: int, width: int) -> t
     return grid.reshape(-1, height, width, c)
 
 
+def on_grid(conv: nn.Module, tokens: torch.Tensor) -> torch.Tensor:
+    """(B, H, W, C) tokens through convolutions that want (B, C, H, W)."""
+    return conv(tokens.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
+
+
 class Attention(nn.Module):
     """Multi-head attention of the queries of one window to its keys. Subclasses project.
 

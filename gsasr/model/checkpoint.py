@@ -14,7 +14,7 @@ from safetensors.torch import save_file
 from ..errors import CheckpointError
 from ..files import require_file, shipped, writing
 from .decoder import GaussianDecoder
-from .encoders import EDSR
+from .encoders import ENCODERS, family_of
 from .network import GSASR, ModelConfig
 from .presets import PRESETS
 
@@ -64,7 +64,9 @@ def build(
     name: the network's name; origin: what to call the file in an error.
     """
     try:
-        config = ModelConfig(EDSR.config_from(encoder), GaussianDecoder.config_from(decoder))
+        config = ModelConfig(
+            ENCODERS[family_of(encoder)].config_from(encoder), GaussianDecoder.config_from(decoder)
+        )
         if config.decoder.channels % config.decoder.heads:
             raise ValueError("heads must divide channels")
         model = GSASR(config, name)

@@ -25,6 +25,7 @@ from .attention import (
     ScaleAttention,
     WindowAttention,
     from_windows,
+    on_grid,
     to_windows,
 )
 from .state import State, count, side
@@ -213,11 +214,6 @@ def head(dim: int, hidden: int, columns: int) -> nn.Sequential:
 def unused(layer: nn.Module) -> nn.Module:
     """A layer that only feeds the query that does not matter: kept for checkpoints, not trained."""
     return layer.requires_grad_(False)
-
-
-def on_grid(conv: nn.Conv2d, tokens: torch.Tensor) -> torch.Tensor:
-    """A convolution over tokens (B, H, W, C)."""
-    return conv(tokens.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
 
 
 class Block(nn.Module):

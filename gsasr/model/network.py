@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -10,15 +11,25 @@ from torch import nn
 from ..errors import RequestError
 from ..gaussians import Gaussians
 from .decoder import DecoderConfig, GaussianDecoder
-from .encoders import EDSR, EDSRConfig
+from .encoders import ENCODERS, EDSRConfig, EncoderConfig
 
 
 @dataclass(frozen=True)
 class ModelConfig:
     """What a network is made of. The defaults are the paper's EDSR-baseline model."""
 
-    encoder: EDSRConfig = field(default_factory=EDSRConfig)
+    encoder: EncoderConfig = field(default_factory=EDSRConfig)
     decoder: DecoderConfig = field(default_factory=DecoderConfig)
+
+    @property
+    def multiple(self) -> int:
+        """What picture sides must divide by: both windows must fit."""
+        return math.lcm(self.encoder.window, self.decoder.window)
+
+    def __str__(self) -> str:
+        """The family, such as "HAT with the enhanced decoder"."""
+        kind = "enhanced" if self.decoder.enhanced else "paper's"
+        return f"{self.encoder.family} with the {kind} decoder"
 
 
 class GSASR(nn.Module):
@@ -31,7 +42,7 @@ class GSASR(nn.Module):
         super().__init__()
         self.config = config
         self.name = name
-        self.encoder = EDSR(config.encoder)
+        self.encoder = ENCODERS[config.encoder.family](config.encoder)
         self.decoder = GaussianDecoder(config.decoder, self.encoder.channels)
         self.initialise()
 
@@ -50,7 +61,7 @@ class GSASR(nn.Module):
 
     @property
     def multiple(self) -> int:
-        return self.config.decoder.window
+        return self.config.multiple
 
     def encode(self, lr: torch.Tensor) -> torch.Tensor:
         """(B, 3, h, w) in [0, 1], sides multiples of `multiple` -> (B, channels, h, w)."""
@@ -58,10 +69,11 @@ class GSASR(nn.Module):
 
     def decode(self, features: torch.Tensor, scale: float | torch.Tensor) -> torch.Tensor:
         """(B, channels, h, w) and a scale > 0, one number or (B,) -> (B, N, 9) raw columns."""
-        scale = torch.as_tensor(scale, dtype=torch.float32, device=features.device)
-        if not bool((scale > 0).all()):
+        scale = torch.as_tensor(scale, dtype=torch.float32)
+        # The check would split the graph of torch.compile; a scale on a card would wait for it.
+        if not torch.compiler.is_compiling() and not bool((scale > 0).all()):
             raise RequestError("The conditioning scale must be above 0.")
-        return self.decoder(features, scale.expand(features.shape[0]))
+        return self.decoder(features, scale.to(features.device).expand(features.shape[0]))
 
     def forward(self, lr: torch.Tensor, scale: float | torch.Tensor) -> torch.Tensor:
         return self.decode(self.encode(lr), scale)

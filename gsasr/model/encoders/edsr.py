@@ -3,51 +3,54 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import nn
+
+from ..state import State, count
+from .parts import center_on_grey, soften
 
 
 @dataclass(frozen=True)
 class EDSRConfig:
     """channels: feature width. blocks: residual blocks. The defaults are EDSR-baseline."""
 
+    family: ClassVar[str] = "EDSR"
+    window: ClassVar[int] = 1
+
     channels: int = 64
     blocks: int = 16
+
+    def __str__(self) -> str:
+        return f"EDSR, {self.channels} channels, {self.blocks} blocks"
 
 
 class EDSR(nn.Module):
     """(B, 3, h, w) picture in [0, 1] -> (B, channels, h, w) features."""
 
+    SIGN = "body.0."
+
     def __init__(self, config: EDSRConfig) -> None:
         super().__init__()
-        self.config = config
+        self.channels = config.channels
         self.conv_first = nn.Conv2d(3, config.channels, 3, padding=1)
         self.body = nn.Sequential(*(ResidualBlock(config.channels) for _ in range(config.blocks)))
         self.conv_after_body = nn.Conv2d(config.channels, config.channels, 3, padding=1)
 
-    @property
-    def channels(self) -> int:
-        return self.config.channels
-
     def initialise(self) -> None:
-        """Small residuals, so that deep stacks start stable; features of mid-grey start at 0."""
-        with torch.no_grad():
-            for block in self.body:
-                block.conv1.weight.mul_(0.1)
-                block.conv2.weight.mul_(0.1)
-            self.conv_first.weight.mul_(2)
-            self.conv_first.bias.copy_(-0.5 * self.conv_first.weight.sum((1, 2, 3)))
+        for block in self.body:
+            soften(block.conv1, block.conv2)
+        center_on_grey(self.conv_first)
 
     def forward(self, picture: torch.Tensor) -> torch.Tensor:
         # No global skip: the released encoder computes and drops it.
         return self.conv_after_body(self.body(self.conv_first(picture)))
 
     @staticmethod
-    def config_from(state: dict[str, torch.Tensor]) -> EDSRConfig:
-        """The configuration that has tensors of these shapes."""
-        blocks = 1 + max(int(key.split(".")[1]) for key in state if key.startswith("body."))
-        return EDSRConfig(channels=state["conv_first.weight"].shape[0], blocks=blocks)
+    def config_from(state: State) -> EDSRConfig:
+        """The configuration that has tensors of these shapes. Raises KeyError, ValueError."""
+        return EDSRConfig(channels=len(state["conv_first.weight"]), blocks=count(state, "body"))
 
 
 class ResidualBlock(nn.Module):

@@ -84,12 +84,16 @@ class Attention(nn.Module):
             angles = self._angles()
             mixed = F.scaled_dot_product_attention(turned(q, angles), turned(k, angles), v)
         else:
-            # Windows are small, so plain products; the library's attention guards against rows
-            # that are masked out, which costs a tenth of a training step and cannot happen here.
-            logits = (q * q.shape[-1] ** -0.5) @ k.transpose(-2, -1) + self._bias()
+            bias = self._bias()[None]
             if mask is not None:
-                logits = (logits.unflatten(0, (-1, len(mask))) + mask[:, None]).flatten(0, 1)
-            mixed = logits.softmax(dim=-1).to(v.dtype) @ v
+                bias = (bias + mask[:, None]).repeat(len(q) // len(mask), 1, 1, 1)
+            if torch.is_grad_enabled():
+                # With a bias to train, the library's attention falls back to plain products and
+                # guards against masked rows: a tenth of a training step, and none occur here.
+                logits = (q * q.shape[-1] ** -0.5) @ k.transpose(-2, -1) + bias
+                mixed = logits.softmax(dim=-1).to(v.dtype) @ v
+            else:
+                mixed = F.scaled_dot_product_attention(q, k, v, attn_mask=bias.to(q.dtype))
         return self.proj(mixed.transpose(1, 2).flatten(2))
 
     def _bias(self) -> torch.Tensor:

@@ -16,6 +16,7 @@ from typing import NoReturn
 from .errors import GsasrError, RequestError
 from .memory import require_picture
 from .rasterize import BACKENDS
+from .training.commands import add_commands
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -125,19 +126,6 @@ def evaluate(options: argparse.Namespace) -> None:
             scores = benchmark(model, folder, tuple(options.scales), options.backend, told)
         print(f"{folder.name}: PSNR dB / SSIM on Y, {model.name}\n")
         print(table(scores, options.per_image), end="\n\n")
-
-
-def train(options: argparse.Namespace) -> None:
-    from .training.config import PRESETS
-    from .training.loop import train
-
-    given = {
-        name: getattr(options, name)
-        for name in (field.name for field in dataclasses.fields(PRESETS[options.preset]))
-        if getattr(options, name) is not None
-    }
-    config = dataclasses.replace(PRESETS[options.preset], **given)
-    print(train(options.preset, options.data, options.out, config, options.valid))
 
 
 def chosen_device(name: str) -> str:
@@ -299,29 +287,8 @@ def parser() -> argparse.ArgumentParser:
     add_model(c)
     add_backend(c)
 
-    add_train(commands.add_parser("train", help="train a network on a folder of pictures"))
+    add_commands(commands)
     return top
-
-
-def add_train(c: argparse.ArgumentParser) -> None:
-    from .training.config import PRESETS, TrainConfig
-
-    c.set_defaults(run=train)
-    c.formatter_class = argparse.RawDescriptionHelpFormatter
-    c.description = "Train a network; run the same command again to go on after a kill."
-    c.epilog = f"settings of the preset that can be changed:\n{TrainConfig.__doc__}"
-    c.add_argument("--preset", choices=sorted(PRESETS), default="lite", help="default lite")
-    c.add_argument("--data", type=Path, required=True, help="folder tree of pictures")
-    c.add_argument("--out", type=Path, required=True, help="folder of the run")
-    c.add_argument("--valid", type=Path, help="folder tree of pictures for validation PSNR")
-    for field in dataclasses.fields(TrainConfig):
-        flag = "--" + field.name.replace("_", "-")
-        value = getattr(PRESETS["lite"], field.name)
-        if isinstance(value, tuple):
-            element = int if field.name == "milestones" else float
-            c.add_argument(flag, type=element, nargs="*", metavar="X")
-        else:
-            c.add_argument(flag, type=type(value), metavar="X")
 
 
 if __name__ == "__main__":

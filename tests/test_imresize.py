@@ -33,8 +33,8 @@ def test_an_edge_takes_the_values_worked_out_by_hand():
 
 
 def test_pixels_beyond_the_edge_repeat_the_last_one():
-    # The half of output 0's taps that lies on the left falls on pixel -1 to -4 or on pixel 0, all
-    # of which are pixel 0 or repeat it: -3 - 9 + 29 + 111 = 128 of 256.
+    # Half of output 0's taps fall on the pixels -3 to 0, all of which are or repeat pixel 0:
+    # -3 - 9 + 29 + 111 = 128 of 256.
     row = np.zeros((2, 8, 1), np.uint8)
     row[:, 0] = 100
     assert downscale(row, 2)[0, 0, 0] == 50

@@ -1,6 +1,5 @@
-"""Training: the data, the schedule, the loop, and going on after a kill."""
+"""Training: the recipes, the loop, and going on after a kill."""
 
-import csv
 import os
 import signal
 import subprocess
@@ -11,91 +10,36 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from training import QUICK, log_rows, write_pictures
 
-from gsasr.errors import CheckpointError, DataError, RequestError
-from gsasr.model import load_model
-from gsasr.training.config import PRESETS, TrainConfig
-from gsasr.training.data import CropSampler, downscale, find_pictures, validation_pairs
+from gsasr.errors import BackendError, CheckpointError, DataError, RequestError
+from gsasr.files import writing
+from gsasr.model import PRESETS, load_model
+from gsasr.training import loop, optimizer
+from gsasr.training.config import NETWORK_RECIPES, RECIPES, Execution, TrainConfig, recipe
 from gsasr.training.loop import train
-
-QUICK = TrainConfig(patch=8, batch=2, steps=6, warmup=2, save_every=2, validate_every=3)
+from gsasr.training.state import read_parts
 
 
 @pytest.fixture
-def pictures(tmp_path, images):
-    """A folder tree of three pictures of at least 192 pixels a side."""
-    folder = tmp_path / "pictures"
-    (folder / "more").mkdir(parents=True)
-    for name, path in (("a.png", "astronaut"), ("more/b.jpg", "cat"), ("c.png", "chart")):
-        Image.open(images / f"{path}.png").convert("RGB").save(folder / name)
-    return folder
+def pictures(tmp_path):
+    return write_pictures(tmp_path / "pictures")
 
 
 @pytest.fixture
 def small_preset(monkeypatch, tiny_model):
     """Makes the preset "lite" as small as the tiny model."""
-    from gsasr.training import loop
-
     monkeypatch.setitem(loop.MODELS, "lite", tiny_model.config)
+    monkeypatch.setattr(optimizer, "NARROW", 8)  # it has matrices of 8x8 for Muon
 
 
-def test_pictures_are_found_in_the_whole_tree(pictures):
-    (pictures / "notes.txt").write_text("no picture")
-    assert [p.name for p in find_pictures(pictures)] == ["a.png", "c.png", "b.jpg"]
-    with pytest.raises(DataError, match="no pictures"):
-        find_pictures(pictures / "none")
+def weights(run):
+    return read_parts(run / "state.pt")["model"]
 
 
-def test_downscaling_is_the_antialiased_bicubic_of_pillow(images):
-    picture = Image.open(images / "cat.png").convert("RGB")
-    ours = downscale(_tensor(picture)[None], (50, 75))[0]
-    pillow = _tensor(picture.resize((75, 50), Image.Resampling.BICUBIC))
-    # Pillow rounds to 8 bits between its two passes.
-    assert float((ours - pillow).abs().max()) <= 2 / 255 + 1e-6
-    assert float((ours - pillow).abs().mean()) < 0.3 / 255
-    assert torch.equal((ours * 255).round() / 255, ours)
-
-
-def _tensor(picture: Image.Image) -> torch.Tensor:
-    return torch.from_numpy(np.array(picture)).permute(2, 0, 1).float() / 255
-
-
-def test_a_batch_depends_on_seed_and_step_alone(pictures):
-    one, other = (CropSampler(pictures, 8, (1.0, 4.0)) for _ in range(2))
-    one.batch(3, 0, 0)
-    for a, b in zip(one.batch(4, 7, 5), other.batch(4, 7, 5), strict=True):
-        assert a.scale == b.scale and torch.equal(a.hr, b.hr) and torch.equal(a.lr, b.lr)
-    assert not torch.equal(one.batch(1, 7, 5)[0].lr, one.batch(1, 7, 6)[0].lr)
-
-
-def test_crops_have_the_size_of_their_scale_and_belong_together(pictures):
-    for sample in CropSampler(pictures, 16, (1.0, 4.0)).batch(20, 0, 0):
-        assert sample.lr.shape == (3, 16, 16)
-        assert 1 <= sample.scale <= 4
-        assert sample.hr.shape[1] == sample.hr.shape[2] == round(16 * sample.scale)
-        again = downscale(sample.hr[None], (16, 16))[0]
-        assert float((again - sample.lr).abs().max()) <= 1.01 / 255
-
-
-def test_pictures_too_small_or_damaged_are_left_out_and_named(pictures, capsys):
-    (pictures / "broken.png").write_bytes((pictures / "a.png").read_bytes()[:2000])
-    (pictures / "text.png").write_text("not a picture")
-    Image.new("RGB", (16, 200)).save(pictures / "thin.png")
-    sampler = CropSampler(pictures, 8, (1.0, 4.0))
-    assert "thin.png" not in [p.name for p in sampler.paths]
-    for step in range(30):
-        sampler.batch(2, 0, step)
-    said = capsys.readouterr().err
-    assert said.count("text.png") == 1 and said.count("broken.png") == 1
-    with pytest.raises(DataError, match="at least 2000x2000"):
-        CropSampler(pictures, 500, (1.0, 4.0))
-
-
-def test_validation_pairs_cover_each_picture_at_each_scale(pictures):
-    pairs = validation_pairs(pictures)
-    assert [p.scale for p in pairs] == [2, 3, 4] * 3
-    assert pairs[2].lr.shape == (3, 48, 48) and pairs[2].hr.shape == (3, 192, 192)
+def assert_equal_weights(one, other, **tolerance):
+    for name, value in weights(one).items():
+        torch.testing.assert_close(weights(other)[name], value, msg=name, **tolerance)
 
 
 def test_the_rate_warms_up_holds_and_falls_to_zero():
@@ -106,12 +50,33 @@ def test_the_rate_warms_up_holds_and_falls_to_zero():
     assert 0 < config.rate_at(999) < 1e-6
 
 
-def test_the_paper_preset_states_the_papers_schedule():
-    paper = PRESETS["edsr-baseline"]
+def test_the_papers_recipe_states_the_papers_settings():
+    paper = recipe("edsr-baseline")
+    assert paper is RECIPES["paper"]
     assert (paper.patch, paper.batch, paper.steps, paper.rate) == (48, 64, 500_000, 2e-4)
     assert (paper.scale_min, paper.scale_max, paper.ema, paper.warmup) == (1, 4, 0.999, 2000)
+    assert (paper.optimizer, paper.betas, paper.clip) == ("adam", (0.9, 0.99), 0)
+    assert paper.precision == "float32"
+    assert paper.rate_at(999) == pytest.approx(1e-4)
     halved = [paper.rate_at(s) for s in (249_999, 250_000, 400_000, 450_000, 475_000)]
     assert halved == pytest.approx([2e-4, 1e-4, 5e-5, 2.5e-5, 1.25e-5])
+    decoder = PRESETS["edsr-baseline"].decoder
+    assert (decoder.window, decoder.channels, decoder.self_blocks) == (12, 180, 6)
+    assert decoder.gaussians_per_pixel == 16
+
+
+def test_the_recipe_of_larger_backbones_differs_in_patch_scales_and_precision_alone():
+    large = RECIPES["large"]
+    assert (large.patch, large.scale_max, large.precision) == (64, 16, "bfloat16")
+    assert replace(large, patch=48, scale_max=4.0, precision="float32") == RECIPES["paper"]
+
+
+def test_every_network_has_a_recipe_whose_patch_fits_its_windows():
+    assert set(NETWORK_RECIPES) == set(PRESETS)
+    for network, name in NETWORK_RECIPES.items():
+        assert RECIPES[name].patch % PRESETS[network].multiple == 0
+    with pytest.raises(RequestError, match="Unknown recipe"):
+        recipe("lite", "fast")
 
 
 def test_impossible_settings_are_refused():
@@ -119,6 +84,7 @@ def test_impossible_settings_are_refused():
         {"scale_min": 0.5},
         {"batch": 0},
         {"precision": "int8"},
+        {"optimizer": "sgd"},
         {"betas": (0.9,)},
         {"ema": 7.0},
         {"seed": -1},
@@ -126,12 +92,19 @@ def test_impossible_settings_are_refused():
     ):
         with pytest.raises(RequestError):
             TrainConfig(**wrong)
+    for wrong in ({"device": "tpu"}, {"workers": -1}, {"cache": -1.0}):
+        with pytest.raises(RequestError):
+            Execution(**wrong)
 
 
-def test_training_lowers_the_loss_and_writes_a_model_that_loads(pictures, tmp_path, small_preset):
+@pytest.mark.parametrize("name", ["adam", "muon"])
+def test_training_lowers_the_loss_and_writes_a_model_that_loads(
+    images, tmp_path, small_preset, name
+):
     config = replace(QUICK, steps=40, batch=4, rate=1e-2, save_every=10, validate_every=40)
-    path = train("lite", pictures, tmp_path / "run", config, valid=pictures / "more")
-    rows = list(csv.DictReader((tmp_path / "run" / "log.csv").open()))
+    config = replace(config, optimizer=name)
+    path = train("lite", images, tmp_path / "run", config, valid=images)
+    rows = log_rows(tmp_path / "run")
     assert [int(row["step"]) for row in rows] == [10, 20, 30, 40]
     assert float(rows[-1]["loss"]) < 0.9 * float(rows[0]["loss"])
     assert 5 < float(rows[-1]["psnr_x2"]) < 50
@@ -139,26 +112,71 @@ def test_training_lowers_the_loss_and_writes_a_model_that_loads(pictures, tmp_pa
     assert model(torch.rand(1, 3, 8, 8), 2.0).shape == (1, 256, 9)
 
 
-def test_steps_after_a_resume_equal_those_without(pictures, tmp_path, small_preset):
-    steady = replace(QUICK, decay=1e-9)  # no decay, so that the length does not matter
-    whole = load_model(train("lite", pictures, tmp_path / "whole", steady))
+@pytest.mark.parametrize("name", ["adam", "muon"])
+def test_steps_after_a_resume_equal_those_without(pictures, tmp_path, small_preset, name):
+    steady = replace(QUICK, decay=1e-9, optimizer=name)  # the length does not matter
+    train("lite", pictures, tmp_path / "whole", steady)
     train("lite", pictures, tmp_path / "parts", replace(steady, steps=4))
-    parts = load_model(train("lite", pictures, tmp_path / "parts", steady))
-    for name, value in whole.state_dict().items():
-        torch.testing.assert_close(parts.state_dict()[name], value, msg=name)
-    rows = list(csv.DictReader((tmp_path / "parts" / "log.csv").open()))
-    assert [row["step"] for row in rows] == ["2", "3", "4", "6"]
+    train("lite", pictures, tmp_path / "parts", steady)
+    assert_equal_weights(tmp_path / "whole", tmp_path / "parts")
+    assert [row["step"] for row in log_rows(tmp_path / "parts")] == ["2", "3", "4", "6"]
 
 
-def test_a_state_of_another_network_is_refused(pictures, tmp_path, small_preset):
-    (tmp_path / "run").mkdir()
+def test_gradient_checkpointing_and_workers_change_no_result(pictures, tmp_path, small_preset):
+    train("lite", pictures, tmp_path / "plain", QUICK, execution=Execution(workers=0))
+    other = Execution(workers=1, recompute=True)
+    train("lite", pictures, tmp_path / "other", QUICK, execution=other)
+    assert_equal_weights(tmp_path / "plain", tmp_path / "other")
+
+
+def test_recomputed_blocks_are_not_kept_until_the_backward_pass(tiny_model):
+    from gsasr.training.network import recompute
+
+    def kept() -> int:
+        """Bytes that autograd holds on to after a forward pass."""
+        sizes = []
+
+        def pack(tensor):
+            sizes.append(tensor.numel() * tensor.element_size())
+            return tensor
+
+        with torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor):
+            tiny_model(torch.rand(1, 3, 16, 16), 2.0).sum()
+        return sum(sizes)
+
+    before = kept()
+    recompute(tiny_model)
+    assert kept() < 0.5 * before
+
+
+def test_bfloat16_changes_the_loss_by_little(pictures, tmp_path, small_preset):
+    losses = []
+    for precision in ("float32", "bfloat16"):
+        run = tmp_path / precision
+        train("lite", pictures, run, replace(QUICK, steps=2, precision=precision))
+        losses.append(float(log_rows(run)[-1]["loss"]))
+    assert losses[0] != losses[1]
+    assert losses[0] == pytest.approx(losses[1], rel=0.02)
+
+
+def test_a_state_of_another_network_or_optimizer_is_refused(pictures, tmp_path, small_preset):
+    run = tmp_path / "run"
+    run.mkdir()
     for content in ({"step": 3}, {"model": {}, "average": {}, "optimizer": {}, "step": 1}):
-        torch.save(content, tmp_path / "run" / "state.pt")
+        torch.save(content, run / "state.pt")
         with pytest.raises(CheckpointError, match="use another --out"):
-            train("lite", pictures, tmp_path / "run", QUICK)
-    (tmp_path / "run" / "state.pt").write_bytes(b"half a file")
+            train("lite", pictures, run, QUICK)
+    (run / "state.pt").write_bytes(b"half a file")
     with pytest.raises(CheckpointError, match="use another --out"):
-        train("lite", pictures, tmp_path / "run", QUICK)
+        train("lite", pictures, run, QUICK)
+    (run / "state.pt").unlink()
+    train("lite", pictures, run, QUICK)
+    before = (run / "state.pt").read_bytes()
+    with pytest.raises(CheckpointError, match="does not fit"):
+        train("lite", pictures, run, replace(QUICK, optimizer="muon"))
+    with pytest.raises(CheckpointError, match="does not fit"):
+        train("edsr-baseline", pictures, run, replace(QUICK, patch=12))
+    assert (run / "state.pt").read_bytes() == before
 
 
 def test_a_kill_loses_only_the_steps_since_the_last_save(pictures, tmp_path):
@@ -171,7 +189,7 @@ def test_a_kill_loses_only_the_steps_since_the_last_save(pictures, tmp_path):
         time.sleep(0.05)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    reached = int(list(csv.DictReader((run / "log.csv").open()))[-1]["step"])
+    reached = int(log_rows(run)[-1]["step"])
     load_model(run / "model.safetensors")
     state = torch.load(run / "state.pt", weights_only=True)["step"]
     assert state in (reached, reached - 1)
@@ -183,10 +201,28 @@ def test_a_kill_loses_only_the_steps_since_the_last_save(pictures, tmp_path):
 def test_a_diverging_run_stops_and_keeps_what_was_saved(pictures, tmp_path, small_preset):
     run = tmp_path / "run"
     path = train("lite", pictures, run, replace(QUICK, steps=2))
-    saved = path.read_bytes()
-    with pytest.raises(DataError, match="diverged at step"):
+    with pytest.raises(DataError, match=r"diverged at step \d+; .* lower --rate"):
         train("lite", pictures, run, replace(QUICK, steps=40, rate=1e30, clip=0.0))
-    assert path.read_bytes() == saved or load_model(path)
+    assert load_model(path)  # which refuses weights that are not finite
+    assert all(value.isfinite().all() for value in weights(run).values())
+
+
+def test_a_full_disk_stops_the_run_and_keeps_what_was_saved(
+    pictures, tmp_path, small_preset, monkeypatch
+):
+    run = tmp_path / "run"
+    train("lite", pictures, run, replace(QUICK, steps=2))
+    before = (run / "state.pt").read_bytes()
+
+    def full(parts, path):
+        with writing(path, DataError):
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("gsasr.training.state.write_parts", full)
+    with pytest.raises(DataError, match="No space left on device"):
+        train("lite", pictures, run, QUICK)
+    assert (run / "state.pt").read_bytes() == before
+    assert not [path for path in run.iterdir() if path.name.startswith(".")]
 
 
 def test_a_run_killed_between_its_last_two_files_is_completed(pictures, tmp_path, small_preset):
@@ -201,7 +237,62 @@ def test_a_run_killed_between_its_last_two_files_is_completed(pictures, tmp_path
     ]
 
 
-def test_a_patch_that_does_not_fit_the_windows_is_refused_at_once(pictures, tmp_path):
+def test_a_damaged_picture_is_named_once_and_training_goes_on(
+    pictures, tmp_path, small_preset, capsys
+):
+    (pictures / "z.png").write_bytes((pictures / "0.png").read_bytes()[:900])
+    train("lite", pictures, tmp_path / "run", replace(QUICK, batch=8))
+    assert capsys.readouterr().err.count("z.png") == 1
+
+
+def test_what_cannot_be_trained_is_refused_at_once(pictures, tmp_path):
+    run = tmp_path / "run"
     with pytest.raises(RequestError, match="multiple of 8"):
-        train("lite", pictures, tmp_path / "run", replace(QUICK, patch=33))
-    assert not (tmp_path / "run").exists()
+        train("lite", pictures, run, replace(QUICK, patch=33))
+    if not torch.cuda.is_available():
+        with pytest.raises(BackendError, match="--device cpu"):
+            train("lite", pictures, run, QUICK, execution=Execution(device="cuda"))
+    assert not run.exists()
+
+
+def test_a_compiler_that_is_missing_is_told_in_one_sentence(
+    pictures, tmp_path, small_preset, monkeypatch
+):
+    import torch._inductor.config as inductor
+
+    monkeypatch.setattr(inductor.cpp, "cxx", ("no-such-compiler",))
+    monkeypatch.setattr(inductor, "fx_graph_cache", False)
+    torch._dynamo.reset()
+    with pytest.raises(RequestError, match="leave out --compile"):
+        train("lite", pictures, tmp_path / "run", QUICK, execution=Execution(compile=True))
+
+
+def test_tensorboard_gets_curves_and_pictures(pictures, tmp_path, small_preset):
+    pytest.importorskip("tensorboard", reason="the extra gsasr[tensorboard] is not installed")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    run = tmp_path / "run"
+    train("lite", pictures, run, QUICK, pictures, Execution(tensorboard=True))
+    events = EventAccumulator(str(run / "tensorboard"))
+    events.Reload()
+    losses = [(event.step, event.value) for event in events.Scalars("loss")]
+    rows = log_rows(run)
+    assert losses == [(int(row["step"]), pytest.approx(float(row["loss"]))) for row in rows]
+    assert "psnr_x4" in events.Tags()["scalars"] and "x4/0" in events.Tags()["images"]
+
+
+def test_without_the_package_tensorboard_is_refused(pictures, tmp_path, small_preset, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises(RequestError, match=r"gsasr\[tensorboard\]"):
+        train("lite", pictures, tmp_path / "run", QUICK, execution=Execution(tensorboard=True))
+
+
+def test_renders_shown_while_training_are_pictures_beside_their_truth(pictures, tiny_model):
+    from gsasr.training.data import validation_samples
+    from gsasr.training.loop import validate
+
+    scores, shown = validate(tiny_model, validation_samples(pictures))
+    assert sorted(scores) == ["psnr_x2", "psnr_x3", "psnr_x4"]
+    assert sorted(shown) == ["x4/0", "x4/1", "x4/2"]
+    for picture in shown.values():
+        assert picture.shape == (192, 384, 3) and np.isfinite(picture).all()

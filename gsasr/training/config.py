@@ -1,50 +1,52 @@
-"""What a training run is made of."""
+"""What a training run is made of. Nothing here loads PyTorch, so that `--help` answers at once."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 from ..errors import RequestError
+
+DEVICES = ("auto", "cpu", "cuda")
+OPTIMIZERS = ("adam", "muon")
+PRECISIONS = ("float32", "bfloat16")
+
+
+def _setting(default: Any, text: str, choices: tuple[str, ...] | None = None) -> Any:
+    """A field with its documentation, which `gsasr train --help` shows too."""
+    return field(default=default, metadata={"help": text, "choices": choices})
 
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Settings of one run; stored in its checkpoints.
+    """What is learned, and how: everything that a result depends on. Stored in its checkpoints.
 
-    patch: side of the low-resolution crop, pixels, a multiple of the network's window.
-    batch: crops per step.
-    scale_min, scale_max: the target scale of each crop is uniform in this range.
-    steps: length of the run. A run that is resumed may be given another length.
-    rate: Adam learning rate after `warmup` steps of linear warm-up.
-    decay: the last share of the run, over which the rate falls to zero as half a cosine.
-    milestones: if given, the rate is halved at these steps instead (the paper's schedule).
-    betas: of Adam. clip: largest gradient norm, 0: no clipping. ema: decay of averaged weights.
-    precision: of the network's forward pass and activations, "float32" or "bfloat16" (autocast;
-        about 1.5 times as fast on a CPU with bfloat16 instructions). Weights stay float32.
-    save_every, validate_every: steps between checkpoints and between validations.
-    seed: of the weights and the data; the data of a step depends on (seed, step) alone.
+    What each setting means is written beside it. Raises RequestError for impossible ones.
     """
 
-    patch: int = 32
-    batch: int = 8
-    scale_min: float = 1.0
-    scale_max: float = 4.0
-    steps: int = 20_000
-    rate: float = 1e-3
-    warmup: int = 200
-    decay: float = 0.5
-    milestones: tuple[int, ...] = ()
-    betas: tuple[float, float] = (0.9, 0.99)
-    clip: float = 1.0
-    ema: float = 0.999
-    precision: str = "float32"
-    save_every: int = 200
-    validate_every: int = 1000
-    seed: int = 0
+    patch: int = _setting(32, "side of the low-resolution crops, pixels: a multiple of the window")
+    batch: int = _setting(8, "crops per step, over all processes")
+    scale_min: float = _setting(1.0, "the target scale of a crop is uniform from here")
+    scale_max: float = _setting(4.0, "to here; a picture needs sides of at least patch * this")
+    steps: int = _setting(20_000, "length of the run; a run may be resumed with another length")
+    optimizer: str = _setting(
+        "adam", "muon is for the matrices, with adam for the rest", OPTIMIZERS
+    )
+    rate: float = _setting(1e-3, "learning rate after the warm-up")
+    warmup: int = _setting(200, "steps of linear warm-up")
+    decay: float = _setting(0.5, "last share of the run, in which the rate falls as half a cosine")
+    milestones: tuple[int, ...] = _setting((), "instead of that: the rate is halved at these steps")
+    betas: tuple[float, float] = _setting((0.9, 0.99), "of Adam")
+    clip: float = _setting(1.0, "largest norm of the gradient; 0: any")
+    ema: float = _setting(0.999, "decay of the averaged weights, which are what is evaluated")
+    precision: str = _setting("float32", "of the network; weights stay float32", PRECISIONS)
+    save_every: int = _setting(200, "steps between checkpoints: what a kill can cost")
+    validate_every: int = _setting(1000, "steps between validations")
+    seed: int = _setting(0, "of weights and data; a crop depends on (seed, step, place) alone")
 
     def __post_init__(self) -> None:
-        if not 1 <= self.scale_min <= self.scale_max:
+        if not 1 <= self.scale_min <= self.scale_max < float("inf"):
             raise RequestError("Training scales must satisfy 1 <= scale_min <= scale_max.")
         if min(self.patch, self.batch, self.steps, self.save_every, self.validate_every) < 1:
             raise RequestError("patch, batch, steps, save_every and validate_every must be >= 1.")
@@ -54,8 +56,15 @@ class TrainConfig:
             raise RequestError("ema must lie in [0, 1); warmup, clip, seed and milestones be >= 0.")
         if not 0 < self.rate < float("inf") or not 0 < self.decay <= 1:
             raise RequestError("rate must be above 0, and decay in (0, 1].")
-        if self.precision not in ("float32", "bfloat16"):
+        if self.precision not in PRECISIONS:
             raise RequestError("The precision must be float32 or bfloat16.")
+        if self.optimizer not in OPTIMIZERS:
+            raise RequestError("The optimizer must be adam or muon.")
+
+    @property
+    def largest_crop(self) -> int:
+        """Side of the largest ground-truth crop, pixels."""
+        return round(self.patch * self.scale_max)
 
     def rate_at(self, step: int) -> float:
         """Learning rate of step 0, 1, ... `steps` - 1."""
@@ -66,18 +75,79 @@ class TrainConfig:
         return rate * 0.5 * (1 - math.cos(math.pi * min(1.0, remaining)))
 
 
-PRESETS = {
-    # Paper Sec. 4.1; the crop is 48s x 48s with s uniform in [1, 4].
-    "edsr-baseline": TrainConfig(
-        patch=48,
-        batch=64,
-        steps=500_000,
-        rate=2e-4,
-        warmup=2000,
-        milestones=(250_000, 400_000, 450_000, 475_000),
-        clip=0.0,
-        save_every=1000,
-        validate_every=5000,
+@dataclass(frozen=True)
+class Execution:
+    """How a run is carried out. Changes no result beyond rounding, and may change on resuming."""
+
+    device: str = _setting("auto", "auto: cuda where there is a card", DEVICES)
+    workers: int | None = _setting(
+        None, "processes that prepare crops; 0: none beside training; default: by the machine"
+    )
+    cache: float = _setting(4.0, "GiB of decoded pictures that the workers together keep")
+    compile: bool = _setting(False, "torch.compile the network; needs a C++ compiler or Triton")
+    recompute: bool = _setting(
+        False, "gradient checkpointing: much less memory for about a third more time"
+    )
+    tensorboard: bool = _setting(False, "also write curves and pictures for TensorBoard to the run")
+
+    def __post_init__(self) -> None:
+        if self.device not in DEVICES:
+            raise RequestError("The device must be auto, cpu or cuda.")
+        if (self.workers or 0) < 0 or not 0 <= self.cache < float("inf"):
+            raise RequestError("workers and cache must not be negative.")
+
+
+ORDINARY = Execution()
+
+_PAPER = TrainConfig(
+    patch=48,
+    batch=64,
+    scale_min=1.0,
+    scale_max=4.0,
+    steps=500_000,
+    optimizer="adam",
+    rate=2e-4,
+    warmup=2000,
+    milestones=(250_000, 400_000, 450_000, 475_000),
+    betas=(0.9, 0.99),
+    clip=0.0,
+    ema=0.999,
+    precision="float32",
+    save_every=1000,
+    validate_every=10_000,
+)
+
+RECIPES = {
+    # Sec. 4.1 of the paper; the ground-truth crop is 48s x 48s.
+    "paper": _PAPER,
+    # For the largest backbone.
+    "large": TrainConfig(
+        **vars(_PAPER) | {"patch": 64, "scale_max": 16.0, "precision": "bfloat16"}
     ),
+    # Ours: two hours on a CPU.
     "lite": TrainConfig(),
 }
+
+NETWORK_RECIPES = {
+    "lite": "lite",
+    "edsr-baseline": "paper",
+    "edsr-paper": "paper",
+    "rdn-paper": "paper",
+    "swinir-paper": "paper",
+    "edsr-div2k": "paper",
+    "edsr-df2k": "paper",
+    "rdn-div2k": "paper",
+    "rdn-df2k": "paper",
+    "swinir-div2k": "paper",
+    "swinir-df2k": "paper",
+    "hatl-sa1b": "large",
+}
+"""The recipe of each network, where no other is asked for."""
+
+
+def recipe(network: str, name: str | None = None) -> TrainConfig:
+    """The recipe of this name, or without one that of the network."""
+    name = name or NETWORK_RECIPES[network]
+    if name not in RECIPES:
+        raise RequestError(f"Unknown recipe {name}; use one of {', '.join(RECIPES)}.")
+    return RECIPES[name]

@@ -1,30 +1,35 @@
-"""The training loop (paper Sec. 4.1): crops, L1 on the rendered crop, Adam, averaged weights."""
+"""The training loop (paper Sec. 4.1): crops, L1 on the rendered crop, averaged weights."""
 
 from __future__ import annotations
 
-import csv
 import json
 import os
-import time
+import sys
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import nn
 from tqdm import tqdm
 
 from .. import rasterize
 from ..errors import DataError, RequestError
 from ..evaluation.metrics import psnr_y
-from ..files import writing
 from ..model import GSASR, activate, save_model
 from ..model import PRESETS as MODELS
+from ..predict import predict
 from ..view import View
-from .config import TrainConfig
-from .data import CropSampler, Sample, validation_pairs
-from .state import TrainState
+from .config import ORDINARY, Execution, TrainConfig
+from .data import CropSampler, Sample, validation_samples
+from .loader import Batch, load_batches
+from .log import Board, Log
+from .network import trainable
+from .optimizer import set_rate
+from .parallel import Group, joined
+from .state import TrainState, read_parts
 
-COLUMNS = ("step", "seconds", "loss", "rate", "psnr_x2", "psnr_x3", "psnr_x4")
+SHOWN = 4  # validation samples whose pictures go to TensorBoard
 
 
 def train(
@@ -33,63 +38,80 @@ def train(
     out: str | os.PathLike,
     config: TrainConfig,
     valid: str | os.PathLike | None = None,
+    execution: Execution = ORDINARY,
 ) -> Path:
     """Train a preset on the pictures below `data`; returns the file of averaged weights.
 
     `out` receives model.safetensors (averaged weights with their configuration, for
     `load_model`), state.pt (to go on after a kill: call `train` again) and log.csv.
-    valid: folder of pictures for validation PSNR; none without it.
+    valid: folder for validation PSNR, see `validation_samples`; none without it.
+    Under `torchrun` every process calls this with the same arguments.
 
-    Raises DataError for unusable data or a full disk, CheckpointError for a state of another
-    network.
+    Raises DataError for unusable data, a full disk or a loss that is not finite, CheckpointError
+    for a state of another network.
     """
     out = Path(out)
-    multiple = MODELS[preset].decoder.window
+    multiple = MODELS[preset].multiple
     if config.patch % multiple:
         raise RequestError(f"--patch must be a multiple of {multiple} for {preset}.")
-    sampler = CropSampler(data, config.patch, (config.scale_min, config.scale_max))
-    pairs = validation_pairs(valid) if valid else []
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        for stale in (*out.glob(".state-*.pt"), *out.glob(".model-*.safetensors")):
-            stale.unlink()  # half a file of a run that was killed
-    except OSError as error:
-        raise DataError(f"Cannot write to the folder {out}: {error.strerror}.") from error
-    torch.manual_seed(config.seed)
-    model = GSASR(MODELS[preset], preset).train()
-    state = TrainState.fresh(model, config.betas)
-    if (out / "state.pt").exists():
-        state.load(out / "state.pt")
-    log = Log(out / "log.csv", state.step)
-
-    bar = tqdm(total=config.steps, initial=state.step, unit="step", disable=None)
-    while state.step < config.steps:
-        rate = config.rate_at(state.step)
-        loss = train_step(state, sampler.batch(config.batch, config.seed, state.step), rate, config)
-        log.loss(loss)
-        bar.update()
-        validate_now = state.step % config.validate_every == 0 or state.step == config.steps
-        if validate_now or state.step % config.save_every == 0:
-            scores = validate(state.average, pairs) if validate_now else {}
-            row = log.write(state.step, rate, scores)
-            bar.set_postfix(loss=row["loss"], psnr_x4=row["psnr_x4"] or "-")
-            state.save(out / "state.pt")
-            save_model(state.average, out / "model.safetensors", describe(config, state.step))
-    bar.close()
-    # Once more: the last run may have been killed between the two.
-    save_model(state.average, out / "model.safetensors", describe(config, state.step))
+    with joined(execution.device) as group:
+        group.share(config.batch)
+        sampler = CropSampler(data, config.patch, (config.scale_min, config.scale_max))
+        samples = validation_samples(valid) if valid and group.leads else []
+        if group.leads:
+            _make_folder(out)
+        state = starting_state(preset, config, group, out / "state.pt")
+        network = trainable(state.model, execution, group)
+        record = Record(out, state, config, samples, execution) if group.leads else None
+        news = sampler.news if group.leads else []
+        sampler.news = []
+        for loaded in load_batches(
+            sampler, config, range(state.step, config.steps), group, execution
+        ):
+            news += loaded.news
+            if loaded.failure:
+                tell(news)
+                raise loaded.failure
+            loss = train_step(network, state, loaded.batch, config, group)
+            saving = state.step % config.save_every == 0 or state.step == config.steps
+            validating = state.step % config.validate_every == 0 or state.step == config.steps
+            if saving or validating or group.size == 1:
+                news = group.all(news)
+            if record:
+                record.add(loss, news)
+                if saving or validating:
+                    record.save(validating)
+            if saving or validating or group.size == 1:
+                news = []
+        if record:
+            record.close()
     return out / "model.safetensors"
 
 
-def train_step(state: TrainState, samples: list[Sample], rate: float, config: TrainConfig) -> float:
-    """One step of Adam on a batch; returns its L1 loss. Raises DataError if it is not finite."""
-    for group in state.optimizer.param_groups:
-        group["lr"] = rate
-    loss = batch_loss(state.model, samples, config.precision)
+def starting_state(preset: str, config: TrainConfig, group: Group, path: Path) -> TrainState:
+    """The state in `path` if there is one, else a fresh one; the same in every process."""
+    torch.manual_seed(config.seed)
+    state = TrainState.fresh(GSASR(MODELS[preset], preset).train().to(group.device), config)
+    parts = group.from_leader(read_parts(path) if group.leads and path.exists() else None)
+    if parts is not None:
+        state.restore(parts, path)
+    return state
+
+
+def train_step(
+    network: nn.Module, state: TrainState, batch: Batch, config: TrainConfig, group: Group
+) -> float:
+    """One step on this process's share of a batch; returns the L1 loss of the whole batch.
+
+    Raises DataError, in every process, if loss or gradient are not finite.
+    """
+    set_rate(state.optimizer, config.rate_at(state.step))
+    loss = batch_loss(network, batch.to(group.device), config.precision)
     state.optimizer.zero_grad(set_to_none=True)
     loss.backward()
     norm = torch.nn.utils.clip_grad_norm_(state.model.parameters(), config.clip or float("inf"))
-    if not bool(norm.isfinite()) or not bool(loss.isfinite()):
+    loss = group.mean(loss.detach())
+    if not bool(norm.isfinite() & loss.isfinite()):
         raise DataError(
             f"Training diverged at step {state.step + 1}; run it again with a lower --rate. "
             "What was saved before is kept."
@@ -100,75 +122,97 @@ def train_step(state: TrainState, samples: list[Sample], rate: float, config: Tr
     return loss.item()
 
 
-def batch_loss(model: GSASR, samples: list[Sample], precision: str) -> torch.Tensor:
+def batch_loss(network: nn.Module, batch: Batch, precision: str) -> torch.Tensor:
     """Mean over the samples of the mean absolute error of the rendered crop."""
-    lr = torch.stack([sample.lr for sample in samples])
-    scales = torch.tensor([sample.scale for sample in samples])
-    with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bfloat16"):
-        raw = model(lr, scales)
-    losses = []
+    device, size = batch.lr.device.type, tuple(batch.lr.shape[2:])
+    lr = (batch.lr.float() / 255).contiguous(memory_format=torch.channels_last)
+    with torch.autocast(device, torch.bfloat16, enabled=precision == "bfloat16"):
+        raw = network(lr, batch.scales)
+    raw = raw.float()
     if not bool(raw.isfinite().all()):  # a rasterizer would draw these as nothing
         return raw.sum()
-    for columns, sample in zip(raw.float(), samples, strict=True):
-        gaussians = activate(columns, tuple(sample.lr.shape[1:]))
-        rendered = rasterize.render(gaussians, crop_view(sample), backend="cpu")
-        losses.append((rendered - sample.hr.permute(1, 2, 0)).abs().mean())
-    return torch.stack(losses).mean()
+    gaussians = activate(raw.flatten(0, 1), size)
+    views = [View.to_size(size, sides) for sides in batch.sizes]
+    drawn = rasterize.render_batch(gaussians, [raw.shape[1]] * len(views), views, backend=device)
+    errors = [(a - b).abs().mean() for a, b in zip(drawn, batch.truths(), strict=True)]
+    return torch.stack(errors).mean()
 
 
-def crop_view(sample: Sample) -> View:
-    return View.to_size(tuple(sample.lr.shape[1:]), tuple(sample.hr.shape[1:]))
-
-
-@torch.inference_mode()
-def validate(model: GSASR, pairs: list[Sample]) -> dict[str, float]:
-    """Mean PSNR (Y, dB) per scale over the validation pairs, as {"psnr_x2": ...}."""
-    from ..predict import predict
-
+@torch.no_grad()
+def validate(model: GSASR, samples: list[Sample]) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+    """Mean PSNR (Y, dB) per scale as {"psnr_x2": ...}, and a few renders beside their truths."""
     scores: dict[str, list[float]] = {}
-    for sample in pairs:
-        gaussians = predict(model, sample.lr.permute(1, 2, 0).numpy(), sample.scale)
-        rendered = rasterize.render(gaussians, crop_view(sample), backend="cpu").numpy()
-        truth = sample.hr.permute(1, 2, 0).numpy()
-        score = psnr_y(rendered, truth, border=int(sample.scale))
-        scores.setdefault(f"psnr_x{int(sample.scale)}", []).append(score)
-    return {name: float(np.mean(values)) for name, values in scores.items()}
+    shown: dict[str, np.ndarray] = {}
+    for number, sample in enumerate(samples):
+        lr, truth = (tensor.numpy().astype(np.float32) / 255 for tensor in (sample.lr, sample.hr))
+        scale = round(sample.scale)
+        gaussians = predict(model, lr, sample.scale)
+        view = View.to_size(lr.shape[:2], truth.shape[:2])
+        drawn = rasterize.render(gaussians, view, backend=gaussians.mean.device.type).cpu().numpy()
+        scores.setdefault(f"psnr_x{scale}", []).append(psnr_y(drawn, truth, border=scale))
+        if scale == 4 and len(shown) < SHOWN:
+            shown[f"x4/{number // 3}"] = np.concatenate([drawn, truth], axis=1)
+    return {name: float(np.mean(values)) for name, values in scores.items()}, shown
 
 
-def describe(config: TrainConfig, step: int) -> dict[str, str]:
-    return {"training": json.dumps(asdict(config)), "step": str(step)}
+class Record:
+    """What a run leaves in its folder and says on the terminal; only the leader has one."""
+
+    def __init__(
+        self,
+        out: Path,
+        state: TrainState,
+        config: TrainConfig,
+        samples: list[Sample],
+        execution: Execution,
+    ) -> None:
+        self.out, self.state, self.config, self.samples = out, state, config, samples
+        self._device = next(state.average.parameters()).device
+        self._log = Log(out / "log.csv", state.step)
+        self._board = Board(out / "tensorboard", state.step) if execution.tensorboard else None
+        self._told: set[str] = set()
+        self._bar = tqdm(total=config.steps, initial=state.step, unit="step", disable=None)
+
+    def add(self, loss: float, news: list[str]) -> None:
+        """A step was done; `news` is said once."""
+        tell([line for line in dict.fromkeys(news) if line not in self._told])
+        self._told.update(news)
+        self._log.loss(loss)
+        self._bar.update()
+
+    def save(self, validating: bool) -> None:
+        """Raises DataError or CheckpointError if it cannot be written; older files stay."""
+        scores, shown = validate(self.state.average, self.samples) if validating else ({}, {})
+        self.state.average.to(self._device)  # prediction gives a card up where memory is short
+        row = self._log.write(self.state.step, self.config.rate_at(self.state.step - 1), scores)
+        if self._board:
+            self._board.pictures(shown, self.state.step)
+            self._board.row(row)
+        self._bar.set_postfix(loss=row["loss"], psnr_x4=row["psnr_x4"] or "-")
+        self.state.save(self.out / "state.pt")
+        self._save_model()
+
+    def close(self) -> None:
+        self._bar.close()
+        if self._board:
+            self._board.close()
+        self._save_model()  # once more: the last run may have been killed between the two
+
+    def _save_model(self) -> None:
+        training = json.dumps(asdict(self.config))
+        metadata = {"training": training, "step": str(self.state.step)}
+        save_model(self.state.average, self.out / "model.safetensors", metadata)
 
 
-class Log:
-    """log.csv: a row per checkpoint. Rows after the step that a run resumes from are dropped."""
+def tell(news: list[str]) -> None:
+    for line in news:
+        tqdm.write(line, file=sys.stderr)
 
-    def __init__(self, path: Path, step: int) -> None:
-        self.path = path
-        self._rows: list[dict[str, str]] = []
-        if path.exists() and step:
-            with path.open(newline="") as file:
-                rows = list(csv.DictReader(file))
-            self._rows = [
-                row for row in rows if None not in row.values() and int(row["step"]) <= step
-            ]
-        before = float(self._rows[-1]["seconds"]) if self._rows else 0.0
-        self._started = time.monotonic() - before
-        self._losses: list[float] = []
 
-    def loss(self, value: float) -> None:
-        self._losses.append(value)
-
-    def write(self, step: int, rate: float, scores: dict[str, float]) -> dict[str, str]:
-        """Add the mean loss since the last row; returns the row. Raises DataError."""
-        row = {name: f"{scores[name]:.3f}" if name in scores else "" for name in COLUMNS}
-        row["step"] = str(step)
-        row["seconds"] = f"{time.monotonic() - self._started:.0f}"
-        row["loss"] = f"{np.mean(self._losses):.5f}"
-        row["rate"] = f"{rate:.2e}"
-        self._losses.clear()
-        self._rows.append(row)
-        with writing(self.path, DataError) as beside, beside.open("w", newline="") as file:
-            writer = csv.DictWriter(file, COLUMNS)
-            writer.writeheader()
-            writer.writerows(self._rows)
-        return row
+def _make_folder(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for stale in (*out.glob(".state-*.pt"), *out.glob(".model-*.safetensors")):
+            stale.unlink()  # half a file of a run that was killed
+    except OSError as error:
+        raise DataError(f"Cannot write to the folder {out}: {error.strerror}.") from error

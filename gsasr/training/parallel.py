@@ -1,0 +1,105 @@
+"""One process or many: who takes part in a run, as `torchrun` says in the environment."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import Any
+
+import torch
+import torch.distributed as dist
+
+from ..errors import BackendError, DataError, RequestError
+
+PATIENCE = timedelta(hours=1)  # how long the others wait while the first one validates
+
+
+@dataclass(frozen=True)
+class Group:
+    """The processes of a run. device: of this one. rank: its number. size: how many there are."""
+
+    device: torch.device
+    rank: int = 0
+    size: int = 1
+
+    @property
+    def leads(self) -> bool:
+        """Is this the one that writes, validates and talks?"""
+        return self.rank == 0
+
+    def share(self, batch: int) -> range:
+        """Which samples of a batch are this process's. Raises RequestError if they are uneven."""
+        if batch % self.size:
+            raise RequestError(
+                f"The batch of {batch} cannot be shared by {self.size} processes; "
+                f"use a multiple of {self.size} for --batch."
+            )
+        each = batch // self.size
+        return range(self.rank * each, (self.rank + 1) * each)
+
+    def mean(self, value: torch.Tensor) -> torch.Tensor:
+        """Mean of a tensor over the processes."""
+        if self.size > 1:
+            dist.all_reduce(value)
+            value /= self.size
+        return value
+
+    def from_leader(self, value: Any) -> Any:
+        """What the leader passes, in every process."""
+        if self.size > 1:
+            box = [value]
+            dist.broadcast_object_list(box, device=self.device)
+            return box[0]
+        return value
+
+    def all(self, values: list) -> list:
+        """The lists of all processes as one, in every process."""
+        if self.size > 1:
+            parts: list[list] = [[]] * self.size
+            dist.all_gather_object(parts, values)
+            return [value for part in parts for value in part]
+        return values
+
+
+@contextmanager
+def joined(device: str) -> Iterator[Group]:
+    """The group that this process belongs to, alone unless started by `torchrun`.
+
+    device: "auto", "cpu" or "cuda"; of several cards each process takes the one of its local rank.
+
+    Raises BackendError where there is no such device, DataError if another process of the group
+    stops; what it says itself is the reason.
+    """
+    size = int(os.environ.get("WORLD_SIZE", 1))
+    rank = int(os.environ.get("RANK", 0))
+    chosen = _device(device, int(os.environ.get("LOCAL_RANK", 0)))
+    if size == 1:
+        yield Group(chosen)
+        return
+    try:
+        backend = "nccl" if chosen.type == "cuda" else "gloo"
+        dist.init_process_group(backend, timeout=PATIENCE, rank=rank, world_size=size)
+        yield Group(chosen, rank, size)
+        dist.destroy_process_group()
+    except RuntimeError as error:
+        if isinstance(error, dist.DistError) or "onnection" in str(error):
+            raise DataError("Another process of this run has stopped; see what it said.") from error
+        raise
+
+
+def _device(name: str, local_rank: int) -> torch.device:
+    there = torch.cuda.is_available()
+    if name == "auto":
+        name = "cuda" if there else "cpu"
+    if name == "cpu":
+        return torch.device("cpu")
+    if not there:
+        raise BackendError("PyTorch finds no NVIDIA card here; use --device cpu.")
+    cards = torch.cuda.device_count()
+    if local_rank >= cards:
+        raise BackendError(f"There are {cards} cards; start at most {cards} processes here.")
+    torch.cuda.set_device(local_rank)
+    return torch.device("cuda", local_rank)

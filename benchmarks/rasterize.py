@@ -20,10 +20,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import platform
-import statistics
-import time
-from collections.abc import Callable
 from ctypes import c_float, c_int
 from pathlib import Path
 
@@ -31,6 +27,7 @@ import numba
 import numpy as np
 import torch
 from fields import plane
+from measure import machine, median_seconds, peak_memory
 
 from gsasr.gaussians import Gaussians
 from gsasr.rasterize import cuda, footprint, nvrtc, render
@@ -52,7 +49,7 @@ def main() -> None:
     options.add_argument("--most", type=float, default=2e9, help="pixel visits by the paper's loop")
     arguments = options.parse_args()
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    print(f"{machine(device)}, PyTorch {torch.__version__}\n")
+    print(machine(device), end="\n\n")
     print("| source | scale | Gaussians | backend | forward, ms | both, ms | memory, MiB "
           "| evaluations, G/s | float32 | gather | forward : paper | both : paper |")  # fmt: skip
     print("|---|---|---|---|---|---|---|---|---|---|---|---|")
@@ -89,7 +86,7 @@ def row(
 
     both()
     memory = peak_memory(both, backend)
-    times = [median_ms(work, backend, repeats) for work in (forward, both)]
+    times = [1e3 * median_seconds(work, repeats, backend) for work in (forward, both)]
     rate = footprint.GRADIENT_CUT * float(area.sum()) / times[0] / 1e6  # G/s
     shares = card_shares(field, view, rate) if backend == "cuda" else ("-", "-")
     ratios = [f"{a / b:.1f}" if a else "-" for a, b in zip(slow[:2], times, strict=True)]
@@ -99,41 +96,6 @@ def row(
         *shares, *ratios,
     ]  # fmt: skip
     print(f"| {' | '.join(cells)} |", flush=True)
-
-
-def median_ms(work: Callable[[], object], backend: str, repeats: int) -> float:
-    """Median wall time of `repeats` calls, milliseconds, after one that is not counted."""
-    times = []
-    for _ in range(repeats + 1):
-        finish(backend)
-        start = time.perf_counter()
-        work()
-        finish(backend)
-        times.append(1e3 * (time.perf_counter() - start))
-    return statistics.median(times[1:])
-
-
-def finish(backend: str) -> None:
-    if backend == "cuda":
-        torch.cuda.synchronize()
-
-
-def peak_memory(work: Callable[[], object], backend: str) -> int:
-    """Bytes by which memory grows at most during the work."""
-    if backend == "cuda":
-        torch.cuda.reset_peak_memory_stats()
-        before = torch.cuda.memory_allocated()
-        work()
-        return torch.cuda.max_memory_allocated() - before
-    Path("/proc/self/clear_refs").write_text("5")  # Linux: forget the highest resident size
-    before = resident("VmRSS")
-    work()
-    return resident("VmHWM") - before
-
-
-def resident(name: str) -> int:
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(name))
 
 
 def card_shares(field: Gaussians, view: View, rate: float) -> tuple[str, str]:
@@ -216,7 +178,8 @@ def paper_on_card(field: Gaussians, view: View, most: float) -> tuple[float, flo
         launch("paper_backward", count, count, *shared, pixels, grads)
 
     share = count / len(field)
-    return (*(median_ms(work, "cuda", 1) / share for work in (forward, both)), share)
+    times = [1e3 * median_seconds(work, 1, "cuda") / share for work in (forward, both)]
+    return (*times, share)
 
 
 def paper_on_host(field: Gaussians, view: View, most: float) -> tuple[float, float, float]:
@@ -228,8 +191,8 @@ def paper_on_host(field: Gaussians, view: View, most: float) -> tuple[float, flo
     pixels = np.zeros((height, width, 3), np.float32)
     box = R * (width - 1) / 2, R * (height - 1) / 2
     share = count / len(field)
-    work = lambda: _paper(*arrays, view.scale[0], *box, pixels)  # noqa: E731
-    return median_ms(work, "cpu", 1) / share, 0.0, share
+    seconds = median_seconds(lambda: _paper(*arrays, view.scale[0], *box, pixels), 1)
+    return 1e3 * seconds / share, 0.0, share
 
 
 @numba.njit(fastmath=True)
@@ -246,17 +209,6 @@ def _paper(mean, std, rho, peak, scale, box_x, box_y, pixels):
                 weight = math.exp(-0.5 * q)
                 for channel in range(3):
                     pixels[y, x, channel] += weight * peak[n, channel]
-
-
-def machine(device: str) -> str:
-    if device == "cuda":
-        return torch.cuda.get_device_name()
-    model = [
-        line.partition(":")[2].strip()
-        for line in Path("/proc/cpuinfo").read_text().splitlines()
-        if line.startswith("model name")
-    ]
-    return f"{model[0] if model else platform.processor()}, {len(model)} cores"
 
 
 if __name__ == "__main__":

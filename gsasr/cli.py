@@ -18,6 +18,8 @@ from .memory import require_picture
 from .rasterize import BACKENDS
 from .training.commands import add_commands
 
+MODEL = "name of a model, its .safetensors file, or folder with encoder.pth and decoder.pth"
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns the exit code: 0 for success, 2 for a user's mistake."""
@@ -114,6 +116,17 @@ def info(options: argparse.Namespace) -> None:
 
     for name, value in describe(options.input).items():
         print(f"{name + ':':<22} {value}")
+
+
+def convert(options: argparse.Namespace) -> None:
+    from .errors import CheckpointError
+    from .files import check_writable
+    from .model import load_model, save_model
+
+    if options.output.suffix != ".safetensors":
+        raise CheckpointError(f"{options.output} must end in .safetensors.")
+    check_writable(options.output, CheckpointError)
+    save_model(load_model(options.input), options.output, half=options.half)
 
 
 def evaluate(options: argparse.Namespace) -> None:
@@ -224,7 +237,7 @@ def parser() -> argparse.ArgumentParser:
         return added
 
     def add_model(command: argparse.ArgumentParser) -> None:
-        command.add_argument("--model", default="lite", help="preset name or .safetensors file")
+        command.add_argument("--model", default="lite", help=MODEL)
 
     def add_prediction(command: argparse.ArgumentParser) -> None:
         command.add_argument(
@@ -279,6 +292,11 @@ def parser() -> argparse.ArgumentParser:
 
     c = command(info, "say what is in a picture, a file of Gaussians or a model")
     c.add_argument("input", type=Path, help="file")
+
+    c = command(convert, "write a model as one .safetensors file")
+    c.add_argument("input", help=MODEL)
+    add_output(c, "model to write (.safetensors)")
+    c.add_argument("--half", action="store_true", help="weights as float16, in half the space")
 
     c = command(evaluate, "measure PSNR and SSIM on benchmark folders")
     c.add_argument("folders", type=Path, nargs="+", help="folder with HR/ and LR/x2, LR/x3, ...")

@@ -12,7 +12,12 @@ from .gaussians import Gaussians
 
 
 def describe(path: str | os.PathLike) -> dict[str, str]:
-    """Name -> value, in the order to show. Raises GsasrError for a file that is none of these."""
+    """Name -> value, in the order to show. Raises GsasrError for a file that is none of these.
+
+    path: a file, or a folder with a pair of official checkpoints.
+    """
+    if Path(path).is_dir() or Path(path).suffix in (".pth", ".pt"):
+        return _model(path)
     if Path(path).suffix.lower() != ".safetensors":
         return _picture(image.read(path))
     if _is_field(path):
@@ -65,9 +70,9 @@ def _model(path: str | os.PathLike) -> dict[str, str]:
     parameters = sum(parameter.numel() for parameter in model.parameters())
     return {
         "kind": "network",
-        "encoder": f"EDSR, {encoder.channels} channels, {encoder.blocks} blocks",
-        "decoder": f"paper, {decoder.channels} channels, {decoder.heads} heads, "
-        f"window {decoder.window}, {decoder.self_blocks}x{decoder.self_layers} interaction layers",
+        "family": str(model.config),
+        "encoder": str(encoder),
+        "decoder": str(decoder),
         "Gaussians per pixel": f"{decoder.gaussians_per_pixel:g}",
         "parameters": f"{parameters:,}",
         "picture sides": f"padded to multiples of {model.multiple}",

@@ -1,16 +1,22 @@
 """The network against the released implementation's tensors, and its own contract."""
 
 import json
-from dataclasses import replace
 
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
+from networks import TINY
+from safetensors.torch import load_file
 
-from gsasr.errors import CheckpointError, RequestError
-from gsasr.model import GSASR, PRESETS, activate, load_model, save_model
-from gsasr.model.attention import ScaleAttention, relative_position_index
-from gsasr.model.checkpoint import build
+from gsasr.errors import RequestError
+from gsasr.model import GSASR, PRESETS, activate, load_model
+from gsasr.model.attention import (
+    ScaleAttention,
+    WindowAttention,
+    relative_position_index,
+    turned,
+)
+from gsasr.model.encoders.swinir import shift_mask
+from gsasr.predict import predict
 from gsasr.rasterize import reference
 from gsasr.view import View
 
@@ -139,63 +145,84 @@ def test_features_of_the_wrong_size_and_bad_scales_are_refused(tiny_model):
         tiny_model.decode(torch.rand(1, 8, 8, 8), 0.0)
 
 
-def test_every_weight_that_matters_gets_a_gradient(tiny_model):
-    tiny_model(torch.rand(1, 3, 8, 8), 2.0).square().mean().backward()
-    # The norm before the scale attention only feeds its query, which never matters.
-    dead = (".norm1.", ".norm3.")
-    for name, parameter in tiny_model.named_parameters():
-        scale_norm = dead[0] if "crossattn" in name else dead[1]
-        if scale_norm in name:
+@pytest.mark.parametrize("family", TINY)
+def test_every_weight_that_matters_gets_a_gradient_in_every_family(family):
+    torch.manual_seed(0)
+    model = GSASR(TINY[family])
+    raw = model(torch.rand(1, 3, 2 * model.multiple, model.multiple), 2.0)
+    (raw * torch.randn_like(raw)).sum().backward()
+    for name, parameter in model.named_parameters():
+        # The norm before the scale attention only feeds its query, which never matters.
+        unused = ".norm1." if "window_crossattn" in name else ".norm3."
+        if name.startswith("decoder") and unused in name:
             assert parameter.grad is None
         else:
             assert parameter.grad is not None and bool(parameter.grad.abs().sum() > 0), name
 
 
-def test_a_saved_network_loads_with_the_same_output(tiny_model, tmp_path):
-    save_model(tiny_model, tmp_path / "tiny.safetensors")
-    loaded = load_model(tmp_path / "tiny.safetensors")
-    lr = torch.rand(1, 3, 8, 12)
-    assert loaded.config == tiny_model.config
-    torch.testing.assert_close(loaded(lr, 3.0), tiny_model(lr, 3.0), atol=0, rtol=0)
+@pytest.mark.parametrize("family", TINY)
+def test_networks_start_with_features_of_the_size_of_the_picture_and_grey_gaussians(family):
+    torch.manual_seed(0)
+    model = GSASR(TINY[family]).eval()
+    lr = torch.rand(1, 3, 2 * model.multiple, 2 * model.multiple)
+    with torch.inference_mode():
+        features = model.encode(lr)
+        raw = model.decode(features, 3.0)[0]
+    assert 0.05 < features.std() < 5
+    pixels = lr.shape[2] * lr.shape[3]
+    field = activate(raw, lr.shape[2:])
+    assert len(field) == pixels * model.config.decoder.gaussians_per_pixel
+    assert 0.3 < field.color.mean() < 0.7
+    assert 0.4 < field.opacity.sum() / pixels < 1.2
 
 
-def test_the_shipped_model_loads_by_name():
-    model = load_model("lite")
-    assert model.name == "lite"
-    assert model.config == PRESETS["lite"]
+@pytest.mark.parametrize("position", ["bias", "rotary"])
+def test_attention_can_start_by_looking_at_its_own_position(position):
+    torch.manual_seed(0)
+    attention = WindowAttention(64, 2, 8, 8, position)
+    for layer in (attention.qhead, attention.khead, attention.vhead, attention.proj):
+        torch.nn.init.zeros_(layer.bias)
+    for layer in (attention.qhead, attention.khead):
+        torch.nn.init.zeros_(layer.weight)
+    for layer in (attention.vhead, attention.proj):
+        torch.nn.init.eye_(layer.weight)
+    attention.look_at_own_position()
+    with torch.inference_mode():
+        # Values that number the tokens, so that what comes out are the weights of attention.
+        weights = attention(torch.zeros(1, 64, 64), torch.eye(64)[None])[0]
+    assert bool((weights.argmax(dim=1) == torch.arange(64)).all())
+    assert weights.diagonal().min() > 4 / 64
 
 
-def test_checkpoints_that_do_not_fit_are_refused_with_the_reason(tiny_model, tmp_path):
-    state = {k: v.clone() for k, v in tiny_model.state_dict().items()}
-    path = tmp_path / "model.safetensors"
-
-    def message(changed: dict) -> str:
-        save_file(changed, path)
-        with pytest.raises(CheckpointError) as error:
-            load_model(path)
-        return str(error.value)
-
-    key = "decoder.mlp_block_rho.4.bias"
-    assert f"lacks {key}" in message({k: v for k, v in state.items() if k != key})
-    assert "unknown decoder.more" in message(state | {"decoder.more": torch.zeros(1)})
-    assert f"another shape of {key}" in message(state | {key: torch.zeros(7)})
-    assert "not finite" in message(state | {key: torch.tensor([float("nan")])})
-    assert "no GSASR network" in message({"weight": torch.zeros(3)})
+def test_rotary_attention_depends_on_offsets_only():
+    torch.manual_seed(0)
+    x = torch.randn(1, 1, 1, 8).expand(1, 1, 16, 8)  # the same token on a 4x4 grid
+    attention = WindowAttention(8, 1, 4, 4, "rotary")
+    angles = attention._angles()
+    logits = (turned(x, angles) @ turned(x, angles).transpose(-2, -1))[0, 0].view(4, 4, 4, 4)
+    # one to the right and one down, from (0, 0) and from (2, 1)
+    torch.testing.assert_close(logits[0, 0, 1, 1], logits[2, 1, 3, 2])
+    assert not torch.allclose(logits[0, 0, 1, 1], logits[0, 0, 1, 2])
 
 
-def test_truncated_missing_and_unknown_models_are_refused(tiny_model, tmp_path):
-    path = tmp_path / "model.safetensors"
-    save_model(tiny_model, path)
-    path.write_bytes(path.read_bytes()[:1000])
-    for name, words in ((path, "damaged"), ("nonsense", "no model"), ("edsr-baseline", "shipped")):
-        with pytest.raises(CheckpointError, match=words):
-            load_model(name)
+def test_shifted_windows_do_not_mix_opposite_edges_of_the_picture():
+    mask = shift_mask(8, 8, window=4, shift=2)
+    assert mask.shape == (4, 16, 16)
+    assert bool((mask[0] == 0).all())  # a window of the inside
+    across = mask[1].view(4, 4, 4, 4)  # its right half has wrapped around
+    assert bool((across[:, :2, :, :2] == 0).all() and (across[:, :2, :, 2:] == -100).all())
 
 
-def test_building_leaves_the_given_tensors_alone(tiny_model):
-    encoder = {k: v.clone() for k, v in tiny_model.encoder.state_dict().items()}
-    decoder = {k: v.clone() for k, v in tiny_model.decoder.state_dict().items()}
-    before = set(encoder), set(decoder)
-    built = build(encoder, decoder, "copy", "memory")
-    assert (set(encoder), set(decoder)) == before
-    assert built.config == replace(tiny_model.config)
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 2)])
+def test_every_family_predicts_pictures_smaller_than_its_padding(released, size):
+    model, _ = released
+    photo = torch.rand(*size, 3).numpy()
+    field = predict(model, photo, 2.0).validate()
+    assert field.size == size
+    assert len(field) >= 16 * size[0] * size[1]
+
+
+def test_pictures_that_do_not_fit_the_windows_are_refused_by_the_encoder(released):
+    model, _ = released
+    with pytest.raises(RequestError, match="multiples of 4"):
+        model.encode(torch.rand(1, 3, 8, 6))

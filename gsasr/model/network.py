@@ -65,6 +65,11 @@ class GSASR(nn.Module):
 
     def encode(self, lr: torch.Tensor) -> torch.Tensor:
         """(B, 3, h, w) in [0, 1], sides multiples of `multiple` -> (B, channels, h, w)."""
+        height, width = lr.shape[2:]
+        if height % self.multiple or width % self.multiple:
+            raise RequestError(
+                f"Picture sides must be multiples of {self.multiple}, but are {height}x{width}."
+            )
         return self.encoder(lr)
 
     def decode(self, features: torch.Tensor, scale: float | torch.Tensor) -> torch.Tensor:

@@ -56,7 +56,7 @@ class SwinIR(WindowedEncoder):
         groups = range(count(state, "layers"))
         attention = "layers.{}.residual_group.blocks.0.attn.relative_position_"
         window = side(len(state[attention.format(0) + "index"]))
-        mask = state.get("layers.0.residual_group.blocks.1.attn_mask")
+        masks = [value for key, value in state.items() if key.endswith(".attn_mask")]
         return SwinIRConfig(
             width=len(state["conv_first.weight"]),
             depths=tuple(count(state, f"layers.{i}.residual_group.blocks") for i in groups),
@@ -64,7 +64,7 @@ class SwinIR(WindowedEncoder):
             window=window,
             hidden=len(state["layers.0.residual_group.blocks.0.mlp.fc1.weight"]),
             channels=len(state["conv_before_upsample.0.weight"]),
-            picture=window if mask is None else window * side(len(mask)),
+            picture=window * side(len(masks[0])) if masks else window,
         )
 
 

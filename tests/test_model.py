@@ -35,17 +35,13 @@ def paper_model(golden):
     return load_model(golden / "edsr_paper.safetensors")
 
 
-def test_features_equal_those_of_the_released_code(released):
+@pytest.mark.parametrize("gradients", [False, True])  # attention has a way of its own for each
+def test_features_and_raw_gaussians_equal_those_of_the_released_code(released, gradients):
     model, tensors = released
-    with torch.inference_mode():
+    with torch.set_grad_enabled(gradients):
         features = model.encode(tensors["io.lr"])
-    torch.testing.assert_close(features, tensors["io.features"], atol=1e-5, rtol=0)
-
-
-def test_raw_gaussians_equal_those_of_the_released_code(released):
-    model, tensors = released
-    with torch.inference_mode():
         raw = model.decode(tensors["io.features"], tensors["io.scale"])
+    torch.testing.assert_close(features, tensors["io.features"], atol=1e-5, rtol=0)
     torch.testing.assert_close(raw, tensors["io.raw"], atol=1e-5, rtol=0)
 
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -179,20 +180,41 @@ def test_a_state_of_another_network_or_optimizer_is_refused(pictures, tmp_path, 
     assert (run / "state.pt").read_bytes() == before
 
 
+def descendants(pid: int) -> set[int]:
+    """Processes started by this one and by those, as Linux says."""
+    children = set(map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split()))
+    return children.union(*(descendants(child) for child in children))
+
+
+def alive(pid: int) -> bool:
+    """Is it running, and not just waiting to be noticed dead?"""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
 def test_a_kill_loses_only_the_steps_since_the_last_save(pictures, tmp_path):
     run = tmp_path / "run"
     command = [sys.executable, "-m", "gsasr.cli", "train", "--data", str(pictures)]
     command += ["--out", str(run), "--patch", "8", "--batch", "1", "--save-every", "1"]
+    command += ["--workers", "1"]
     process = subprocess.Popen([*command, "--steps", "100000"])
     deadline = time.monotonic() + 90
     while time.monotonic() < deadline and not (run / "model.safetensors").exists():
         time.sleep(0.05)
+    helpers = descendants(process.pid) if sys.platform == "linux" else set()
+    assert helpers or sys.platform != "linux"
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
     reached = int(log_rows(run)[-1]["step"])
     load_model(run / "model.safetensors")
     state = torch.load(run / "state.pt", weights_only=True)["step"]
     assert state in (reached, reached - 1)
+    deadline = time.monotonic() + 30
+    while any(map(alive, helpers)):
+        assert time.monotonic() < deadline, "the workers live on"
+        time.sleep(0.05)
     done = subprocess.run([*command, "--steps", str(state + 2)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert torch.load(run / "state.pt", weights_only=True)["step"] == state + 2

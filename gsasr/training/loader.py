@@ -12,7 +12,7 @@ from ..errors import DataError, GsasrError
 from .config import Execution, TrainConfig
 from .data import CropSampler, Sample
 from .parallel import Group
-from .processes import default_workers, fresh_processes
+from .processes import default_workers, die_with_parent, fresh_processes
 
 
 @dataclass(frozen=True)
@@ -102,6 +102,7 @@ def load_batches(
         sampler=steps,
         num_workers=workers,
         multiprocessing_context=fresh_processes(__name__) if workers else None,
+        worker_init_fn=die_with_parent,
         prefetch_factor=4 if workers else None,
         pin_memory=group.device.type == "cuda",
     )

@@ -19,7 +19,7 @@ from .. import imresize
 from ..errors import DataError, ImageError, RequestError
 from ..files import writing
 from .data import find_pictures, load
-from .processes import fresh_processes
+from .processes import die_with_parent, fresh_processes
 
 SETTINGS = "prepared.json"  # in the output folder: what it was made with
 COMPRESSION = 3  # of PNG: a fifth larger than the default of 6, written twice as fast
@@ -117,7 +117,9 @@ def prepare(folder: str | os.PathLike, out: str | os.PathLike, task: Task, worke
     made, kept, problems = 0, 0, []
     with (
         tqdm(total=len(paths), unit="picture", disable=None) as bar,
-        ProcessPoolExecutor(min(workers, len(paths)), mp_context=fresh_processes(__name__)) as pool,
+        ProcessPoolExecutor(
+            min(workers, len(paths)), fresh_processes(__name__), die_with_parent
+        ) as pool,
     ):
         try:
             waiting: set[Future] = set()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import os
 import signal
 import sys
 import threading
@@ -41,6 +42,9 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("gsasr: stopped.", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # such as `gsasr doctor | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
     return 0
 
 
@@ -118,6 +122,12 @@ def info(options: argparse.Namespace) -> None:
         print(f"{name + ':':<22} {value}")
 
 
+def doctor(options: argparse.Namespace) -> None:
+    from .doctor import report
+
+    report()
+
+
 def convert(options: argparse.Namespace) -> None:
     from .errors import CheckpointError
     from .files import check_writable
@@ -133,10 +143,12 @@ def evaluate(options: argparse.Namespace) -> None:
     from .evaluation.benchmark import benchmark, table
     from .model import load_model
 
-    model = load_model(options.model)
+    model = load_model(options.model).to(chosen_device(options.device))
     for folder in options.folders:
         with progress(folder.name) as told:
-            scores = benchmark(model, folder, tuple(options.scales), options.backend, told)
+            scores = benchmark(
+                model, folder, tuple(options.scales), options.backend, options.precision, told
+            )
         print(f"{folder.name}: PSNR dB / SSIM on Y, {model.name}\n")
         print(table(scores, options.per_image), end="\n\n")
 
@@ -249,6 +261,8 @@ def parser() -> argparse.ArgumentParser:
         command.add_argument(
             "--device", choices=("auto", "cpu", "cuda"), default="auto", help="of the network"
         )
+
+    def add_tile(command: argparse.ArgumentParser) -> None:
         command.add_argument(
             "--tile",
             type=int,
@@ -273,6 +287,7 @@ def parser() -> argparse.ArgumentParser:
     )
     add_model(c)
     add_prediction(c)
+    add_tile(c)
     add_backend(c)
 
     c = command(predict, "turn a picture into Gaussians")
@@ -281,6 +296,7 @@ def parser() -> argparse.ArgumentParser:
     c.add_argument("--scale", type=positive, default=4.0, help="scale told to the network")
     add_model(c)
     add_prediction(c)
+    add_tile(c)
 
     c = command(render, "draw a file of Gaussians")
     c.add_argument("input", type=Path, help="file of Gaussians")
@@ -293,6 +309,8 @@ def parser() -> argparse.ArgumentParser:
     c = command(info, "say what is in a picture, a file of Gaussians or a model")
     c.add_argument("input", type=Path, help="file")
 
+    command(doctor, "say what this machine has, and what to do about what is missing")
+
     c = command(convert, "write a model as one .safetensors file")
     c.add_argument("input", help=MODEL)
     add_output(c, "model to write (.safetensors)")
@@ -303,6 +321,7 @@ def parser() -> argparse.ArgumentParser:
     c.add_argument("--scales", type=int, nargs="+", default=[2, 3, 4], help="integer scales")
     c.add_argument("--per-image", action="store_true", help="a row for each picture")
     add_model(c)
+    add_prediction(c)
     add_backend(c)
 
     add_commands(commands)

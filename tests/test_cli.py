@@ -218,6 +218,14 @@ def test_a_mistake_ends_the_process_with_code_2_and_no_traceback(bad_files):
     assert "Traceback" not in done.stderr and done.stderr.count("\n") == 1
 
 
+def test_a_reader_that_leaves_early_is_no_failure(bad_files):
+    command = [sys.executable, "-m", "gsasr.cli", "info", str(bad_files / "in.png")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()  # as `| head -0` does
+        assert process.stderr.read() == b""
+    assert process.returncode == 141
+
+
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
 def test_an_unwritable_folder_is_refused_before_the_work(run, bad_files):
     closed = bad_files / "closed"

@@ -32,6 +32,7 @@ def benchmark(
     folder: str | os.PathLike,
     scales: tuple[int, ...] = (2, 3, 4),
     backend: str = "cpu",
+    precision: str = "float32",
     progress: Callable[[float], None] = lambda share: None,
 ) -> list[Score]:
     """Scores of every picture of one benchmark set.
@@ -52,7 +53,8 @@ def benchmark(
             truth = image.read(folder / "HR" / name).color[:height, :width]
             if truth.shape[:2] != (height, width) or min(height, width) < 11 + 2 * scale:
                 raise DataError(f"HR/{name} in {folder} does not fit its LR/x{scale} picture.")
-            picture = upscale(model, lr, View.at_scale(lr.shape[:2], scale), backend=backend)
+            view = View.at_scale(lr.shape[:2], scale)
+            picture = upscale(model, lr, view, backend=backend, precision=precision)
             scores.append(
                 Score(name, scale, psnr_y(picture, truth, scale), ssim_y(picture, truth, scale))
             )

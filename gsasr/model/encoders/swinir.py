@@ -110,4 +110,5 @@ def shift_mask(
 
     regions = 3 * region(height)[:, None] + region(width)
     tokens = to_windows(regions[None, :, :, None], window)[..., 0]  # [windows, window^2]
-    return -100.0 * (tokens[:, :, None] != tokens[:, None, :])
+    apart = tokens[:, :, None] != tokens[:, None, :]
+    return torch.zeros(apart.shape, device=device).masked_fill_(apart, -100.0)

@@ -86,7 +86,7 @@ class Execution:
     cache: float = _setting(4.0, "GiB of decoded pictures that the workers together keep")
     compile: bool = _setting(False, "torch.compile the network; needs a C++ compiler or Triton")
     recompute: bool = _setting(
-        False, "gradient checkpointing: much less memory for about a third more time"
+        False, "gradient checkpointing: much less memory for about a quarter more time"
     )
     tensorboard: bool = _setting(False, "also write curves and pictures for TensorBoard to the run")
 

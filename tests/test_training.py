@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -318,3 +318,23 @@ def test_renders_shown_while_training_are_pictures_beside_their_truth(pictures, 
     assert sorted(shown) == ["x4/0", "x4/1", "x4/2"]
     for picture in shown.values():
         assert picture.shape == (192, 384, 3) and np.isfinite(picture).all()
+
+
+def test_help_documents_every_setting_with_what_each_recipe_says_and_loads_no_network():
+    code = (
+        "import sys\nfrom gsasr import cli\n"
+        "for name in ('train', 'prepare', 'pack', 'unpack'):\n"
+        "    try: cli.main([name, '--help'])\n"
+        "    except SystemExit as stopped: assert stopped.code == 0\n"
+        "assert 'torch' not in sys.modules, 'torch was loaded'\n"
+    )
+    environment = os.environ | {"COLUMNS": "200"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment
+    )
+    assert done.returncode == 0, done.stderr
+    for field in (*fields(TrainConfig), *fields(Execution)):
+        assert f"--{field.name.replace('_', '-')} " in done.stdout
+        assert field.metadata["help"][:40] in done.stdout
+    assert "(paper: 48, large: 64, lite: 32)" in done.stdout
+    assert "250000 400000 450000 475000" in done.stdout

@@ -38,9 +38,10 @@ def weights(run):
     return read_parts(run / "state.pt")["model"]
 
 
-def assert_equal_weights(one, other, **tolerance):
-    for name, value in weights(one).items():
-        torch.testing.assert_close(weights(other)[name], value, msg=name, **tolerance)
+def assert_equal_weights(one, other):
+    expected, found = weights(one), weights(other)
+    for name, value in expected.items():
+        torch.testing.assert_close(found[name], value, msg=name)
 
 
 def test_the_rate_warms_up_holds_and_falls_to_zero():

@@ -79,13 +79,13 @@ def predict_tile(
     halo = _padded(HALO, multiple)
     x0, y0, x1, y1 = tile.x0 - halo, tile.y0 - halo, tile.x1 + halo, tile.y1 + halo
     crop = image[_reflected(y0, y1, height)][:, _reflected(x0, x1, width)]
-    # Channels last, which convolutions prefer.
     lr = torch.from_numpy(np.ascontiguousarray(crop, np.float32)).permute(2, 0, 1)[None]
+    model.to(memory_format=torch.channels_last)  # as `lr` is: the layout that convolutions prefer
     device = next(model.parameters()).device
     with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
         raw = model(lr.to(device), scale)[0]
     local = activate(raw.float(), (y1 - y0, x1 - x0))
-    per_pixel = model.config.decoder.seeds * int(np.prod(model.config.decoder.shuffle)) / multiple
+    per_pixel = model.config.decoder.gaussians_per_pixel**0.5  # along a side
     inside_x = _core(x0, x1, tile.x0, tile.x1, width, per_pixel)
     inside_y = _core(y0, y1, tile.y0, tile.y1, height, per_pixel)
     kept = local[(inside_y[:, None] & inside_x[None, :]).flatten().to(device)]

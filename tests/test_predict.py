@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import torch
+from networks import TINY
 
 from gsasr import image
 from gsasr.errors import Cancelled, RequestError
-from gsasr.model import activate, load_model
+from gsasr.model import GSASR, activate, load_model
 from gsasr.picture import conditioning_scale, render, resample_alpha, upscale
 from gsasr.predict import PRECISIONS, plan, predict, predict_tile, predict_tiles
 from gsasr.rasterize import reference
@@ -52,6 +53,17 @@ def test_any_size_is_padded_by_reflection_and_covered_with_gaussians(tiny_model,
     assert len(field) >= 4 * size[0] * size[1]
     covered = render(field, scale=2).max()
     assert np.isfinite(covered) and covered > 0
+
+
+@pytest.mark.parametrize("family", TINY)
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (13, 30)])
+def test_every_family_predicts_every_size(family, size):
+    model = GSASR(TINY[family], family).eval()
+    field = predict(model, picture(*size), 2.0, tile=12).validate()
+    # Every pixel has its Gaussians, and so have the four around the picture and those of padding.
+    rows, columns = (-(-side // model.multiple) * model.multiple + 8 for side in size)
+    per_pixel = model.config.decoder.gaussians_per_pixel
+    assert per_pixel * size[0] * size[1] <= len(field) <= per_pixel * rows * columns
 
 
 def test_tiles_cover_the_picture_once(tiny_model):

@@ -16,7 +16,10 @@ from gsasr.training.parallel import Group
 from gsasr.training.state import read_parts
 
 STEADY = replace(QUICK, batch=4, steps=4, save_every=1, validate_every=100, decay=1e-9)
-OPTIONS = "--patch 8 --batch 4 --warmup 2 --save-every 1 --validate-every 100 --decay 1e-9"
+OPTIONS = (
+    "--patch 8 --batch 4 --warmup 2 --save-every 1 --validate-every 100 --decay 1e-9 "
+    "--optimizer adam --precision float32"
+)
 
 
 def environment() -> dict[str, str]:

@@ -55,7 +55,7 @@ def test_a_packed_state_takes_a_third_and_keeps_weights_to_three_digits(tmp_path
         for moments in (False, True)
     ]
     weights = sum(p.numel() for p in state.model.parameters())
-    assert sizes[0] < 3.7 * weights and sizes[1] < 6 * weights
+    assert sizes[0] < 4 * weights and sizes[1] < 6.5 * weights  # of 16 bytes per weight
     back = read_parts(unpack(tmp_path / "files", tmp_path / "other"))
     was = read_parts(run / "state.pt")
     assert back["step"] == 3 and back["model"].keys() == was["model"].keys()

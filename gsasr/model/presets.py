@@ -41,17 +41,17 @@ PRESETS = {
     "edsr-baseline": ModelConfig(),
     # Ours: small enough for a CPU, and shipped trained.
     "lite": ModelConfig(
-        EDSRConfig(channels=48, blocks=8),
+        EDSRConfig(channels=48, blocks=4),
         DecoderConfig(
-            channels=48,
+            channels=32,
             heads=4,
             window=8,
             seeds=8,
             cross_layers=2,
-            self_blocks=2,
+            self_blocks=1,
             self_layers=2,
             shuffle=(2, 1),
-            head_expansion=2,
+            head_expansion=1,
         ),
     ),
 }

@@ -9,6 +9,7 @@ import argparse
 import dataclasses
 import os
 import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -172,6 +173,12 @@ def train(options: argparse.Namespace) -> None:
     path = train(options.preset, options.data, options.out, config, options.valid, execution)
     if rank == "0":
         print(path)
+    if "WORLD_SIZE" in os.environ:
+        # All is written. Threads of gloo that outlast the interpreter abort the process now and
+        # then, which torchrun would report as a failed run.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)
 
 
 def prepare(options: argparse.Namespace) -> None:

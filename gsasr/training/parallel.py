@@ -83,6 +83,7 @@ def joined(device: str) -> Iterator[Group]:
         backend = "nccl" if chosen.type == "cuda" else "gloo"
         dist.init_process_group(backend, timeout=PATIENCE, rank=rank, world_size=size)
         yield Group(chosen, rank, size)
+        dist.barrier()  # nobody leaves while another one still needs an answer
         dist.destroy_process_group()
     except RuntimeError as error:
         if isinstance(error, dist.DistError) or "onnection" in str(error):

@@ -80,7 +80,8 @@ def predict_tile(
     x0, y0, x1, y1 = tile.x0 - halo, tile.y0 - halo, tile.x1 + halo, tile.y1 + halo
     crop = image[_reflected(y0, y1, height)][:, _reflected(x0, x1, width)]
     lr = torch.from_numpy(np.ascontiguousarray(crop, np.float32)).permute(2, 0, 1)[None]
-    model.to(memory_format=torch.channels_last)  # as `lr` is: the layout that convolutions prefer
+    with torch.inference_mode(False):  # weights moved in inference mode could not be trained again
+        model.to(memory_format=torch.channels_last)  # as `lr` is: what convolutions prefer
     device = next(model.parameters()).device
     with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
         raw = model(lr.to(device), scale)[0]

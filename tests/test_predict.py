@@ -212,3 +212,10 @@ def test_alpha_keeps_its_place_when_resampled():
         assert opaque.min() > 0.999
     beyond = resample_alpha(np.ones((6, 8), np.float32), View((-8.0, -6.0), (1.0, 1.0), (18, 24)))
     assert beyond[6:12, 8:16].mean() > 0.95 and beyond[:4].max() < 0.05
+
+
+def test_a_network_can_be_trained_after_it_has_predicted(golden):
+    model = load_model(golden / "edsr_paper.safetensors")
+    predict(model, np.zeros((4, 4, 3), np.float32), 2.0)
+    model(torch.rand(1, 3, 8, 8), 2.0).sum().backward()
+    assert any(parameter.grad is not None for parameter in model.parameters())

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors import safe_open
 
-from gsasr.errors import RequestError
+from gsasr.errors import BackendError, RequestError
 from gsasr.gaussians import Gaussians
 from gsasr.model import activate
 from gsasr.rasterize import footprint, reference, render
@@ -222,3 +222,39 @@ def test_many_tiny_gaussians_at_one_place_stay_within_the_tolerance(quality):
 def test_an_enormous_gaussian_is_drawn():
     field = one((0.5, 0.5), (1e18, 1e18), opacity=0.5)
     assert render(field, View.at_scale((1, 1), 3), "cpu").mean() == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("quality", ["export", "gradient"])
+def test_the_cpu_draws_nothing_of_a_gaussian_that_is_none_and_gives_it_no_gradient(quality):
+    nan, inf = float("nan"), float("inf")
+    for broken in (
+        one((nan, 0.5), (1, 1)),
+        one((0.5, nan), (1, 1)),
+        one((0.5, 0.5), (nan, 1)),
+        one((0.5, 0.5), (1, nan)),
+        one((0.5, 0.5), (1, inf)),
+        one((0.5, 0.5), (1, 0)),
+        one((0.5, 0.5), (0, 1)),
+        one((0.5, 0.5), (1, 1), nan),
+        one((0.5, 0.5), (1, 1), 1.0),
+        one((0.5, 0.5), (1, 1), -1.5),
+    ):
+        field = broken.map(lambda tensor: tensor.requires_grad_(True))
+        image = render(field, View.at_scale((1, 1), 5), "cpu", quality)
+        assert float(image.detach().abs().max()) == 0.0
+        image.sum().backward()
+        assert float(field.mean.grad.abs().max()) == 0.0
+
+
+def test_auto_draws_by_the_cpu_where_the_kernels_for_a_card_cannot_run(monkeypatch):
+    from gsasr.rasterize import backends, cuda, default_backend, gl
+
+    def too_old():
+        raise BackendError("This card has compute capability 5.0.")
+
+    monkeypatch.setattr(gl, "hardware", lambda: False)
+    monkeypatch.setattr(cuda, "require", lambda: None)
+    assert default_backend() == "cuda"
+    monkeypatch.setattr(cuda, "require", too_old)
+    assert default_backend() == "cpu"
+    assert backends._chosen(random_field(1, (1, 1)), "auto", None) == ("cpu", "export")

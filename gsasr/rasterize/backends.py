@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from ..errors import RequestError
+from ..errors import BackendError, RequestError
 from ..gaussians import Gaussians
 from ..view import View
 from . import BACKENDS
@@ -21,7 +21,7 @@ def render(
     backend: "reference" (dense, for tests), "cpu", "cuda" (NVIDIA), "gl" (OpenGL 4.3, headless
         where there is no window), or "auto": where the Gaussians are ("cuda" or "cpu") if that
         is a card or if a gradient is wanted, else the first of "gl" on a GPU, "cuda", "cpu"
-        that there is.
+        that can run.
     quality: "screen" (error below half an 8-bit step), "export" (below 1e-4) or "gradient"
         (for training); by default "gradient" if a tensor requires it, else "export".
 
@@ -80,12 +80,16 @@ def _chosen(gaussians: Gaussians, backend: str, quality: str | None) -> tuple[st
     require_backend(backend)
     if backend == "auto":
         there = gaussians.mean.device.type
-        backend = there if differentiable or there == "cuda" else default_backend()
+        drawn_there = differentiable or (there == "cuda" and _cuda_runs())
+        backend = there if drawn_there else default_backend()
     return backend, quality
 
 
 def _moved(gaussians: Gaussians, device: str) -> Gaussians:
-    return gaussians.map(lambda tensor: tensor.to(device, torch.float32))
+    """As float32 on a kind of device; where several are of the kind, those on one stay there."""
+    there = gaussians.mean.device
+    target = there if there.type == device else torch.device(device)
+    return gaussians.map(lambda tensor: tensor.to(target, torch.float32))
 
 
 def require_backend(backend: str) -> None:
@@ -104,4 +108,15 @@ def default_backend() -> str:
 
     if gl.hardware():
         return "gl"
-    return "cuda" if torch.cuda.is_available() else "cpu"
+    return "cuda" if _cuda_runs() else "cpu"
+
+
+def _cuda_runs() -> bool:
+    """Whether there is a card, a compiler for it, and code that it takes."""
+    from . import cuda
+
+    try:
+        cuda.require()
+    except BackendError:
+        return False
+    return True

@@ -71,21 +71,28 @@ def _span(center, half, limit):
 
 
 @jit
+def _drawable(center_x, center_y, std_x, std_y, correlation):
+    """Whether a Gaussian is an ellipse at a place: no NaN, nothing infinite, no width of 0."""
+    widths = std_x * std_y * (1.0 - correlation * correlation)
+    return 0.0 < widths < np.inf and np.isfinite(center_x + center_y)
+
+
+@jit
 def _forward(mean, std, rho, peak, cut, ox, oy, sx, sy, image, row_start, row_stop):
     """Add the Gaussians to image rows [row_start, row_stop)."""
     width = image.shape[1]
     for n in range(mean.shape[0]):
         if not cut[n] >= 0.0:
             continue
-        std_y = std[n, 1] * float(sy)  # output pixels
-        center_y = (mean[n, 1] - oy) * sy - 0.5
+        std_x, std_y = std[n, 0] * float(sx), std[n, 1] * float(sy)  # output pixels
+        center_x, center_y = (mean[n, 0] - ox) * sx - 0.5, (mean[n, 1] - oy) * sy - 0.5
+        correlation = float(rho[n])
+        if not _drawable(center_x, center_y, std_x, std_y, correlation):
+            continue
         y0, y1 = _span(center_y, std_y * math.sqrt(cut[n]), row_stop)
         y0 = max(y0, row_start)
         if y0 >= y1:
             continue
-        std_x = std[n, 0] * float(sx)
-        center_x = (mean[n, 0] - ox) * sx - 0.5
-        correlation = float(rho[n])
         narrow = std_x * math.sqrt(1.0 - correlation * correlation)  # std along a row
         falloff = math.exp(-1.0 / (narrow * narrow))
         red, green, blue = peak[n, 0], peak[n, 1], peak[n, 2]
@@ -123,14 +130,14 @@ def _backward(mean, std, rho, peak, cut, ox, oy, sx, sy, upstream, grads, start,
     for n in range(start, stop):
         if not cut[n] >= 0.0:
             continue
-        std_y = std[n, 1] * float(sy)
-        center_y = (mean[n, 1] - oy) * sy - 0.5
+        std_x, std_y = std[n, 0] * float(sx), std[n, 1] * float(sy)
+        center_x, center_y = (mean[n, 0] - ox) * sx - 0.5, (mean[n, 1] - oy) * sy - 0.5
+        correlation = float(rho[n])
+        if not _drawable(center_x, center_y, std_x, std_y, correlation):
+            continue
         y0, y1 = _span(center_y, std_y * math.sqrt(cut[n]), height)
         if y0 >= y1:
             continue
-        std_x = std[n, 0] * float(sx)
-        center_x = (mean[n, 0] - ox) * sx - 0.5
-        correlation = float(rho[n])
         root = math.sqrt(1.0 - correlation * correlation)
         narrow = std_x * root
         falloff = math.exp(-1.0 / (narrow * narrow))

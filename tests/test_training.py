@@ -19,7 +19,8 @@ from gsasr.model import PRESETS, load_model
 from gsasr.training import loop, optimizer
 from gsasr.training.config import NETWORK_RECIPES, RECIPES, Execution, TrainConfig, recipe
 from gsasr.training.loop import train
-from gsasr.training.state import read_parts
+from gsasr.training.parallel import Group
+from gsasr.training.state import read_parts, write_parts
 
 
 @pytest.fixture
@@ -246,6 +247,47 @@ def test_a_full_disk_stops_the_run_and_keeps_what_was_saved(
         train("lite", pictures, run, QUICK)
     assert (run / "state.pt").read_bytes() == before
     assert not [path for path in run.iterdir() if path.name.startswith(".")]
+
+
+def test_a_log_that_is_none_is_refused_and_left_alone(pictures, tmp_path, small_preset):
+    run = tmp_path / "run"
+    train("lite", pictures, run, replace(QUICK, steps=2))
+    good = (run / "log.csv").read_text()
+    for wrong in ("a,b\n1,2\n", good.replace("2,", "two,", 1)):
+        (run / "log.csv").write_text(wrong)
+        with pytest.raises(DataError, match="no log of a run; move it away"):
+            train("lite", pictures, run, QUICK)
+        assert (run / "log.csv").read_text() == wrong
+
+
+@pytest.mark.parametrize("name", ["adam", "muon"])
+def test_a_run_goes_on_with_the_betas_it_is_given(pictures, tmp_path, small_preset, name):
+    run, group = tmp_path / "run", Group(torch.device("cpu"))
+    config = replace(QUICK, steps=2, optimizer=name)
+    train("lite", pictures, run, config)
+    other = replace(config, betas=(0.5, 0.6))
+    state = loop.starting_state("lite", other, group, run / "state.pt")
+    assert state.step == 2
+    assert state.optimizer.param_groups[-1]["betas"] == (0.5, 0.6)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="needs limits of file sizes")
+def test_a_write_that_fails_halfway_says_why_and_keeps_the_old_file(tmp_path):
+    import resource
+
+    path = tmp_path / "state.pt"
+    path.write_bytes(b"old")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, limits[1]))
+    try:
+        with pytest.raises(DataError, match="File too large"):
+            write_parts({"values": torch.rand(1 << 16)}, path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_run_killed_between_its_last_two_files_is_completed(pictures, tmp_path, small_preset):

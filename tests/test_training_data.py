@@ -37,6 +37,7 @@ def equal(one: Batch, other: Batch) -> bool:
 def test_pictures_are_found_in_the_whole_tree_but_hidden_ones(pictures):
     (pictures / "notes.txt").write_text("no picture")
     (pictures / ".half.png").write_bytes(b"left behind by a kill")
+    (pictures / "folder.png").mkdir()
     assert [p.name for p in find_pictures(pictures)] == ["a.png", "c.png", "b.jpg"]
     with pytest.raises(DataError, match="no pictures"):
         find_pictures(pictures / "none")

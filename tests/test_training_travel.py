@@ -87,3 +87,14 @@ def test_large_states_are_split_and_a_missing_file_is_noticed(pictures, tmp_path
             unpack(tmp_path / "files", tmp_path / "third")
     with pytest.raises(CheckpointError, match="does not exist"):
         pack(tmp_path / "nothing", tmp_path / "files")
+
+
+def test_a_state_without_moments_and_one_that_is_none_are_packed_or_refused(pictures, tmp_path):
+    train("lite", pictures, tmp_path / "run", QUICK)
+    pack(tmp_path / "run", tmp_path / "files", moments=False)
+    unpack(tmp_path / "files", tmp_path / "other")
+    again = pack(tmp_path / "other", tmp_path / "again")
+    assert sum(p.stat().st_size for p in again) > 0
+    torch.save({"params": 1}, tmp_path / "other" / "state.pt")
+    with pytest.raises(CheckpointError, match="damaged"):
+        pack(tmp_path / "other", tmp_path / "again")

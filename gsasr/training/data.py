@@ -25,6 +25,7 @@ def find_pictures(folder: str | os.PathLike) -> list[Path]:
         path
         for path in Path(folder).rglob("*")
         if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
+        if path.is_file() or not path.exists()  # a link to nothing is named as broken later
     )
     if not paths:
         raise DataError(f"There are no pictures in {folder}; give a folder of PNG or JPEG files.")

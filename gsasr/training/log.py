@@ -21,11 +21,7 @@ class Log:
         self.path = path
         self._rows: list[dict[str, str]] = []
         if path.exists() and step:
-            with path.open(newline="") as file:
-                rows = list(csv.DictReader(file))
-            self._rows = [
-                row for row in rows if None not in row.values() and int(row["step"]) <= step
-            ]
+            self._rows = _rows_until(path, step)
         before = float(self._rows[-1]["seconds"]) if self._rows else 0.0
         self._started = time.monotonic() - before
         self._losses: list[float] = []
@@ -47,6 +43,21 @@ class Log:
             writer.writeheader()
             writer.writerows(self._rows)
         return row
+
+
+def _rows_until(path: Path, step: int) -> list[dict[str, str]]:
+    """The rows of a log up to a step. Raises DataError for a file that is no log."""
+    try:
+        with path.open(newline="") as file:
+            reader = csv.DictReader(file)
+            if tuple(reader.fieldnames or ()) != COLUMNS:
+                raise ValueError("other columns")
+            rows = [row for row in reader if None not in row.values()]
+        for row in rows:
+            float(row["seconds"])
+        return [row for row in rows if int(row["step"]) <= step]
+    except (OSError, ValueError, csv.Error) as error:
+        raise DataError(f"{path} is no log of a run; move it away to go on without.") from error
 
 
 class Board:

@@ -51,11 +51,15 @@ class TrainState:
 
     def restore(self, parts: dict[str, Any], path: Path) -> None:
         """Go on from the parts of the file `path`. Raises CheckpointError if they do not fit."""
+        betas = [group.get("betas") for group in self.optimizer.param_groups]
         try:
             self.model.load_state_dict(parts["model"])
             self.average.load_state_dict(parts["average"])
             if "optimizer" in parts:  # `pack` may leave it out
                 self.optimizer.load_state_dict(parts["optimizer"])
+            for group, ours in zip(self.optimizer.param_groups, betas, strict=True):
+                if ours:  # those of this run, not of the one that wrote the file
+                    group["betas"] = ours
             self.step = int(parts["step"])
         except Exception as error:  # any damage: the keys, the shapes
             raise CheckpointError(
@@ -66,16 +70,21 @@ class TrainState:
 
 def write_parts(parts: dict[str, Any], path: Path) -> None:
     """Replace the file at once. Raises DataError; the old file stays."""
-    with writing(path, DataError) as beside:
+    with writing(path, DataError) as beside, beside.open("wb") as file:
         try:
-            torch.save(parts, beside)
-        except RuntimeError as error:  # how torch reports a failed write
+            torch.save(parts, file)
+        except RuntimeError as error:  # of torch, on top of what the system said
+            if isinstance(error.__context__, OSError):
+                raise error.__context__ from None
             raise OSError(str(error).splitlines()[0]) from error
 
 
 def read_parts(path: Path) -> dict[str, Any]:
     """What `save` wrote, on the CPU. Raises CheckpointError if the file is damaged."""
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # any damage of a pickle
+        parts = torch.load(path, map_location="cpu", weights_only=True)
+        if not parts.keys() >= {"model", "average", "step"}:
+            raise KeyError("parts")
+        return parts
+    except Exception as error:  # any damage of a pickle, or something else in it
         raise CheckpointError(f"{path} is damaged; delete it or use another --out.") from error

@@ -40,7 +40,7 @@ def pack(run: str | os.PathLike, out: str | os.PathLike, moments: bool = True) -
         if value.is_floating_point()  # tables of indices are equal in both
     }
     packed = {"step": state["step"], "model": weights, "average": difference}
-    if moments:
+    if moments and "optimizer" in state:  # a state unpacked without it has none yet
         packed["optimizer"] = _encode_moments(state["optimizer"])
     stream = io.BytesIO()
     torch.save(packed, stream)

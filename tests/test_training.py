@@ -231,6 +231,23 @@ def test_a_diverging_run_stops_and_keeps_what_was_saved(pictures, tmp_path, smal
     assert all(value.isfinite().all() for value in weights(run).values())
 
 
+def test_weights_that_are_not_finite_are_never_saved(pictures, tmp_path, small_preset, monkeypatch):
+    run = tmp_path / "run"
+    path = train("lite", pictures, run, replace(QUICK, steps=2))
+    sound = torch.optim.Adam.step
+
+    def ruinous(self):
+        sound(self)
+        with torch.no_grad():
+            self.param_groups[0]["params"][0].fill_(float("inf"))
+
+    monkeypatch.setattr(torch.optim.Adam, "step", ruinous)
+    with pytest.raises(DataError, match="diverged at step 3;"):
+        train("lite", pictures, run, replace(QUICK, save_every=1))
+    assert load_model(path)  # which refuses weights that are not finite
+    assert read_parts(run / "state.pt")["step"] == 2
+
+
 def test_a_full_disk_stops_the_run_and_keeps_what_was_saved(
     pictures, tmp_path, small_preset, monkeypatch
 ):

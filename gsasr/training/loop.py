@@ -112,14 +112,18 @@ def train_step(
     norm = torch.nn.utils.clip_grad_norm_(state.model.parameters(), config.clip or float("inf"))
     loss = group.mean(loss.detach())
     if not bool(norm.isfinite() & loss.isfinite()):
-        raise DataError(
-            f"Training diverged at step {state.step + 1}; run it again with a lower --rate. "
-            "What was saved before is kept."
-        )
+        raise _diverged(state.step + 1)
     state.optimizer.step()
     state.step += 1
     state.update_average(config.ema)
     return loss.item()
+
+
+def _diverged(step: int) -> DataError:
+    return DataError(
+        f"Training diverged at step {step}; run it again with a lower --rate. "
+        "What was saved before is kept."
+    )
 
 
 def batch_loss(network: nn.Module, batch: Batch, precision: str) -> torch.Tensor:
@@ -181,7 +185,12 @@ class Record:
         self._bar.update()
 
     def save(self, validating: bool) -> None:
-        """Raises DataError or CheckpointError if it cannot be written; older files stay."""
+        """Raises DataError or CheckpointError if it cannot be written; older files stay.
+
+        So they do where a step made weights that are not finite of gradients that were.
+        """
+        if not all(bool(value.isfinite().all()) for value in self.state.average.parameters()):
+            raise _diverged(self.state.step)
         scores, shown = validate(self.state.average, self.samples) if validating else ({}, {})
         self.state.average.to(self._device)  # prediction gives a card up where memory is short
         row = self._log.write(self.state.step, self.config.rate_at(self.state.step - 1), scores)

@@ -239,6 +239,13 @@ def test_without_a_card_the_backend_says_so():
         render(random_field(1, (1, 1)), View.at_scale((1, 1), 1), backend="cuda")
 
 
+def test_a_pytorch_for_cards_of_another_maker_has_no_such_backend(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.version, "cuda", None)
+    with pytest.raises(BackendError, match="built without CUDA; use --backend gl or cpu"):
+        cuda.require()
+
+
 def test_without_nvrtc_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "cuda.bindings", None)
     with pytest.raises(BackendError, match=r"pip install 'gsasr\[cuda\]'"):

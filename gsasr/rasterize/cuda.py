@@ -169,8 +169,9 @@ def packed(arguments: tuple) -> tuple[ctypes.Array, list]:
 
 def require() -> None:
     """Raise BackendError, with the reason, if no card can run the kernels."""
-    if not torch.cuda.is_available():
-        why = "PyTorch is a CPU build" if torch.version.cuda is None else "no NVIDIA GPU was found"
+    if torch.version.cuda is None or not torch.cuda.is_available():  # AMD's build has the latter
+        there = torch.version.cuda is not None
+        why = "no NVIDIA GPU was found" if there else "PyTorch is built without CUDA"
         raise BackendError(f"The cuda backend cannot run: {why}; use --backend gl or cpu.")
     kernels(torch.device("cuda", torch.cuda.current_device()))
 

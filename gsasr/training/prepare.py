@@ -138,7 +138,9 @@ def prepare(folder: str | os.PathLike, out: str | os.PathLike, task: Task, worke
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
     if not made + kept:
-        raise DataError(f"None of the {len(paths)} pictures in {folder} can be used.")
+        raise DataError(
+            f"None of the {len(paths)} pictures in {folder} can be used, such as: {min(problems)}"
+        )
     again = f" ({kept} were there already)" if kept else ""
     lines = [f"{len(paths) - len(problems)} of {len(paths)} pictures became {made + kept} files"]
     lines[0] += f"{again} in {out}."

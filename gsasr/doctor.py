@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from .errors import BackendError
+from .processor import cores
 
 # What the rasterizer minds: name in OpenGL -> what it is called here, unit
 GL_LIMITS = {
@@ -35,17 +36,11 @@ def examine() -> Iterator[Finding]:
 
 def _python() -> Iterator[Finding]:
     yield Finding("gsasr", f"{importlib.metadata.version('gsasr')}, Python {_version()}")
-    yield Finding("system", f"{platform.platform()}, {_cores()} cores for this process")
+    yield Finding("system", f"{platform.platform()}, {cores()} cores for this process")
 
 
 def _version() -> str:
     return f"{platform.python_version()} ({platform.machine()})"
-
-
-def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _torch() -> Iterator[Finding]:

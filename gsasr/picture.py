@@ -43,7 +43,7 @@ def render(
     elif size is not None:
         view = View.to_size(field.size, size)
     if backend == "auto":
-        backend = rasterize.default_backend()
+        backend = "cuda" if field.mean.is_cuda else rasterize.default_backend()
     # The GPU draws all at once; elsewhere tile by tile, so that progress can be told.
     tiles = split_tiles(field) if backend == "cpu" else [field]
     parts = ((tile, number / len(tiles)) for number, tile in enumerate(tiles, start=1))

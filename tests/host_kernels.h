@@ -1,5 +1,6 @@
 // CUDA kernels built for a host: one loop in place of the grid, for tests without a GPU.
-// It runs kernels that need no barrier and no shared memory; host_kernels.py completes it.
+// It runs kernels without barriers and shared memory, one thread after another, which makes every
+// addition atomic; host_kernels.py completes it.
 
 #include <cmath>
 #include <cstring>

@@ -39,7 +39,7 @@ def load_model(name: str | os.PathLike = "lite") -> GSASR:
     text, path = str(name), Path(name)
     if text in SHIPPED:
         return _load_file(shipped(SHIPPED[text]), text)
-    if text in hub.FOLDERS:
+    if text in hub.FOLDERS and not path.is_dir():
         return _load_published(text)
     if text in PRESETS:
         raise CheckpointError(f"No trained weights of {text} are shipped; give a file of it.")

@@ -57,6 +57,8 @@ def render_batch(
     """
     if sum(counts) != len(gaussians) or len(counts) != len(views):
         raise RequestError("There must be one view and one count per picture, adding up to all.")
+    if not views:
+        return []
     backend, quality = _chosen(gaussians, backend, quality)
     if backend not in DIFFERENTIABLE:
         backend = gaussians.mean.device.type

@@ -8,7 +8,6 @@ follow a two-multiplication recurrence: g(x+1) = g(x) r(x), r(x+1) = r(x) exp(-1
 from __future__ import annotations
 
 import math
-import os
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
@@ -16,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..processor import cores
 from .batch import Picture
 from .jit import jit
 
@@ -190,10 +190,6 @@ def _backward(mean, std, rho, peak, cut, ox, oy, sx, sy, upstream, grads, start,
 _pool: ThreadPoolExecutor | None = None
 
 
-def _threads() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def _arrays(*tensors: Tensor) -> list[np.ndarray]:
     return [tensor.detach().contiguous().numpy() for tensor in tensors]
 
@@ -204,7 +200,7 @@ def _geometry(picture: Picture) -> tuple[float, float, float, float]:
 
 def _runs(length: int, small: bool) -> list[tuple[int, int]]:
     """[0, length) cut into parts for the threads; one part if the work is small."""
-    bounds = np.linspace(0, length, (1 if small else 4 * _threads()) + 1).astype(np.int64)
+    bounds = np.linspace(0, length, (1 if small else 4 * cores()) + 1).astype(np.int64)
     return [(int(a), int(b)) for a, b in pairwise(bounds) if a < b]
 
 
@@ -216,6 +212,6 @@ def _run(kernel, calls: list[tuple]) -> None:
             kernel(*call)
         return
     if _pool is None:
-        _pool = ThreadPoolExecutor(_threads(), thread_name_prefix="rasterize")
+        _pool = ThreadPoolExecutor(cores(), thread_name_prefix="rasterize")
     for future in [_pool.submit(kernel, *call) for call in calls]:
         future.result()

@@ -2,7 +2,9 @@
 
 Forward: project every Gaussian to output pixels, list the tiles it reaches, sort the lists by
 tile, and let every strip of pixels add up its tile's list. Backward: one thread per Gaussian.
-The sort is stable, so a list keeps the order of the Gaussians and results are equal to the bit.
+The sort is stable, so a list keeps the order of the Gaussians and results are equal to the bit
+from run to run. (The size of the tiles follows from the largest scale of a batch, so a picture
+beside a much larger one may differ from itself alone in the last digits.)
 """
 
 from __future__ import annotations
@@ -172,7 +174,9 @@ def require() -> None:
     if torch.version.cuda is None or not torch.cuda.is_available():  # AMD's build has the latter
         there = torch.version.cuda is not None
         why = "no NVIDIA GPU was found" if there else "PyTorch is built without CUDA"
-        raise BackendError(f"The cuda backend cannot run: {why}; use --backend gl or cpu.")
+        raise BackendError(
+            f"The cuda backend cannot run: {why}; use --backend gl or cpu, or --device cpu."
+        )
     kernels(torch.device("cuda", torch.cuda.current_device()))
 
 
@@ -191,7 +195,9 @@ def module(binary: bytes, device: torch.device) -> Launch:
     def checked(result: tuple):
         status, *values = result
         if status != driver.CUresult.CUDA_SUCCESS:
-            raise BackendError(f"The CUDA driver reports {status.name}; use --backend gl or cpu.")
+            raise BackendError(
+                f"The CUDA driver reports {status.name}; use --backend gl or cpu, or --device cpu."
+            )
         return values[0] if values else None
 
     with torch.cuda.device(device):

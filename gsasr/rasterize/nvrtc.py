@@ -59,7 +59,7 @@ def _target(capability: int, architectures: list[int]) -> str:
     if capability < oldest:
         raise BackendError(
             f"This card has compute capability {capability / 10:.1f}, but the kernel needs "
-            f"{oldest / 10:.1f} or newer; use --backend gl or cpu."
+            f"{oldest / 10:.1f} or newer; use --backend gl or cpu, or --device cpu."
         )
     # Machine code runs on later cards of the same major version, PTX on all later cards.
     older = [a for a in architectures if a <= capability]
@@ -94,7 +94,7 @@ def _library():
     except ImportError as error:
         raise BackendError(
             "The cuda backend needs NVIDIA's run-time compiler; "
-            "run `pip install 'gsasr[cuda]'`, or use --backend gl or cpu."
+            "run `pip install 'gsasr[cuda]'`, or use --backend gl or cpu, or --device cpu."
         ) from error
     return nvrtc
 
@@ -107,8 +107,10 @@ def _call(function: str, *arguments, results: int = 1):
     except RuntimeError as error:  # the bindings are there, the library is not
         raise BackendError(
             "NVIDIA's run-time compiler (libnvrtc) was not found; "
-            "run `pip install 'gsasr[cuda]'`, or use --backend gl or cpu."
+            "run `pip install 'gsasr[cuda]'`, or use --backend gl or cpu, or --device cpu."
         ) from error
     if status != nvrtc.nvrtcResult.NVRTC_SUCCESS:
-        raise BackendError(f"{function} failed with {status.name}; use --backend gl or cpu.")
+        raise BackendError(
+            f"{function} failed with {status.name}; use --backend gl or cpu, or --device cpu."
+        )
     return values[0] if results == 1 else values or None

@@ -14,8 +14,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from ..processor import cores
 from .config import NETWORK_RECIPES, RECIPES, Execution, TrainConfig, recipe
-from .processes import cores
 
 TRAIN = """\
 Train a network on a folder of pictures. Each step draws random crops, scales them down, lets the

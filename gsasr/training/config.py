@@ -54,7 +54,7 @@ class TrainConfig:
             raise RequestError("betas must be two numbers in [0, 1).")
         if not 0 <= self.ema < 1 or min(self.warmup, self.clip, self.seed, *self.milestones, 0) < 0:
             raise RequestError("ema must lie in [0, 1); warmup, clip, seed and milestones be >= 0.")
-        if not 0 < self.rate < float("inf") or not 0 < self.decay <= 1:
+        if not 0 < self.rate <= 1e30 or not 0 < self.decay <= 1:
             raise RequestError("rate must be above 0, and decay in (0, 1].")
         if self.precision not in PRECISIONS:
             raise RequestError("The precision must be float32 or bfloat16.")

@@ -149,26 +149,30 @@ def _turned(crop: torch.Tensor, turns: int, mirrored: bool) -> torch.Tensor:
 def validation_samples(folder: str | os.PathLike, side: int = 192) -> list[Sample]:
     """Centre crops (side, side) of every picture, at the scales 2, 3 and 4.
 
-    folder: as `gsasr prepare --valid` makes it, with HR/NAME and LR/x2|x3|x4/NAME, or any tree of
-        pictures, which are then scaled down here. Pictures smaller than `side` are not used.
+    folder: as `gsasr prepare --valid` makes it, with HR/NAME and LR/x2|x3|x4/NAME (those of the
+        scales that are there), or any tree of pictures, which are then scaled down here. Pictures
+        smaller than `side` are not used.
 
     Raises DataError if none is left, ImageError for one that is damaged.
     """
     folder = Path(folder)
     paired = (folder / "HR").is_dir() and (folder / "LR").is_dir()
+    scales = [s for s in (2, 3, 4) if not paired or (folder / f"LR/x{s}").is_dir()]
     samples = []
     for path in find_pictures(folder / "HR" if paired else folder):
         picture = load(path)
         if min(picture.shape[:2]) < side:
             continue
-        for scale in (2, 3, 4):
+        for scale in scales:
             if paired:
                 samples.append(_paired(picture, folder / f"LR/x{scale}" / path.name, scale, side))
             else:
                 hr = _centre(picture, side, side)
                 samples.append(Sample(downscale(hr, (side // scale,) * 2), hr.contiguous()))
     if not samples:
-        raise DataError(f"No validation picture in {folder} is at least {side}x{side} pixels.")
+        raise DataError(
+            f"{folder} holds no picture of at least {side}x{side} pixels for the scales 2, 3 or 4."
+        )
     return samples
 
 

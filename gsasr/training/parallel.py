@@ -14,6 +14,7 @@ import torch.distributed as dist
 
 from ..errors import BackendError, DataError, RequestError
 
+PLACE = {"WORLD_SIZE": "1", "RANK": "0", "LOCAL_RANK": "0"}  # of torchrun, with what lone runs have
 PATIENCE = timedelta(hours=1)  # how long the others wait while the first one validates
 
 
@@ -73,9 +74,13 @@ def joined(device: str) -> Iterator[Group]:
     Raises BackendError where there is no such device, DataError if another process of the group
     stops; what it says itself is the reason.
     """
-    size = int(os.environ.get("WORLD_SIZE", 1))
-    rank = int(os.environ.get("RANK", 0))
-    chosen = _device(device, int(os.environ.get("LOCAL_RANK", 0)))
+    try:
+        size, rank, local = (int(os.environ.get(n, d)) for n, d in PLACE.items())
+    except ValueError as error:
+        raise RequestError(f"{', '.join(PLACE)} must be numbers; let torchrun set them.") from error
+    if size > 1 and "MASTER_ADDR" not in os.environ:
+        raise RequestError("WORLD_SIZE is set without MASTER_ADDR; start the run by torchrun.")
+    chosen = _device(device, local)
     if size == 1:
         yield Group(chosen)
         return

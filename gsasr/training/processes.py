@@ -7,12 +7,7 @@ import os
 import threading
 from multiprocessing.context import BaseContext
 
-
-def cores() -> int:
-    """Processor cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+from ..processor import cores
 
 
 def default_workers(device: str, processes: int) -> int:

@@ -68,10 +68,9 @@ def unpack(folder: str | os.PathLike, run: str | os.PathLike) -> Path:
     folder, target = Path(folder), Path(run) / "state.pt"
     if target.exists():
         raise DataError(f"{target} exists; choose another folder, or delete it.")
-    paths = sorted(folder.glob(NAME.format("*", "*")), key=lambda p: int(p.name.split("-")[1]))
-    if not paths or paths != [
-        folder / NAME.format(number, len(paths)) for number in range(1, len(paths) + 1)
-    ]:
+    found = set(folder.glob(NAME.format("*", "*")))
+    paths = [folder / NAME.format(number, len(found)) for number in range(1, len(found) + 1)]
+    if not found or found != set(paths):
         raise CheckpointError(f"{folder} does not hold all the files of a packed state.")
     try:
         content = b"".join(path.read_bytes() for path in paths)

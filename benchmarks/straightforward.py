@@ -1,8 +1,8 @@
 """The decoder as the paper formulates it, for comparison with ours in `predict.py`.
 
-Same weights, same outputs. The scale embedding is repeated for every token and attended to, with
-queries, keys and a softmax that all weigh equal values; attention keeps its logits in memory; the
-heads run on all tokens at once.
+Same weights, same outputs. The scale embedding is repeated for every token and attended to by the
+library's multi-head attention, whose queries, keys and softmax weigh equal values; window attention
+keeps its logits in memory; the heads run on all tokens at once, and activations are copies.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from unittest import mock
 
 import torch
 import torch.nn.functional as F
+from torch import nn
 
 from gsasr.model import GSASR
 from gsasr.model.attention import MLP, ScaleAttention, from_windows, to_windows
@@ -24,6 +25,9 @@ def straightforward(model: GSASR) -> Iterator[None]:
     """Inside, the model's decoder works the long way. Its weights get no gradients from then on."""
     model.requires_grad_(False)
     heads = model.config.decoder.heads
+    in_place = [m for m in model.modules() if isinstance(m, nn.ReLU) and m.inplace]
+    for activation in in_place:
+        activation.inplace = False
     with (
         mock.patch.object(CrossLayer, "forward", lambda *a: _cross(*a, heads)),
         mock.patch.object(SelfLayer, "forward", lambda *a: _own(*a, heads)),
@@ -31,6 +35,8 @@ def straightforward(model: GSASR) -> Iterator[None]:
         torch.enable_grad(),  # the way that training goes, but there is nothing to record
     ):
         yield
+    for activation in in_place:
+        activation.inplace = True
 
 
 def _cross(layer: CrossLayer, x, positions, guide, embedding, heads: int):
@@ -64,18 +70,13 @@ def _own(layer: SelfLayer, x, embedding, heads: int):
 def _scale_attention(
     attention: ScaleAttention, windows: torch.Tensor, embedding: torch.Tensor, heads: int
 ) -> torch.Tensor:
-    """Multi-head attention of every token to the embedding, once for each token of its window."""
-    count, tokens, _ = windows.shape
+    """The library's attention of every token to one embedding per token of its window."""
+    count, tokens, dim = windows.shape
     repeated = embedding.repeat_interleave(count // len(embedding), dim=0)[:, None]
-    repeated = repeated.repeat(1, tokens, 1)
-    q, k, v = (
-        F.linear(x, weight, bias).unflatten(-1, (heads, -1)).transpose(1, 2)
-        for x, weight, bias in zip(
-            (windows, repeated, repeated),
-            attention.in_proj_weight.chunk(3),
-            attention.in_proj_bias.chunk(3),
-            strict=True,
-        )
-    )
-    weights = (q @ k.transpose(-2, -1) * q.shape[-1] ** -0.5).softmax(dim=-1)
-    return attention.out_proj((weights.to(v.dtype) @ v).transpose(1, 2).flatten(2))
+    repeated = repeated.repeat(1, tokens, 1).transpose(0, 1)
+    mixed, _ = F.multi_head_attention_forward(
+        windows.transpose(0, 1), repeated, repeated, dim, heads,
+        attention.in_proj_weight, attention.in_proj_bias, None, None, False, 0.0,
+        attention.out_proj.weight, attention.out_proj.bias, training=False,
+    )  # fmt: skip
+    return mixed.transpose(0, 1)

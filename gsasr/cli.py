@@ -293,7 +293,7 @@ def parser() -> argparse.ArgumentParser:
     c = command(predict, "turn a picture into Gaussians")
     c.add_argument("input", type=Path, help="picture")
     add_output(c, "file of Gaussians to write (.safetensors)")
-    c.add_argument("--scale", type=positive, default=4.0, help="scale told to the network")
+    c.add_argument("--scale", type=positive, default=3.0, help="scale told to the network")
     add_model(c)
     add_prediction(c)
     add_tile(c)

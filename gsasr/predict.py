@@ -22,9 +22,10 @@ from .gaussians import Gaussians
 from .memory import require_field
 from .model import GSASR, activate
 
-TILE = 192  # side of a core, source pixels, rounded to the network's multiple
+TILE = 256  # side of a core, source pixels, rounded to the network's multiple
 HALO = 16  # rounded likewise; what a tile does not see beyond it changes no 8-bit level
 BEYOND = 4  # source pixels past the picture's edge whose Gaussians still reach inside
+TOLD = 3.0  # conditioning scale by default: what it costs is in docs/prediction.md
 SCALES = (0.1, 1000.0)  # conditioning scales that a network can be told
 PRECISIONS = ("float32", "bfloat16")
 
@@ -67,7 +68,7 @@ def _cut(area: Tile, step: int) -> list[Tile]:
 
 @torch.inference_mode()
 def predict_tile(
-    model: GSASR, image: np.ndarray, tile: Tile, scale: float = 4.0, precision: str = "float32"
+    model: GSASR, image: np.ndarray, tile: Tile, scale: float = TOLD, precision: str = "float32"
 ) -> Gaussians:
     """Gaussians of one tile, positioned in the whole picture, on the model's device.
 
@@ -85,11 +86,11 @@ def predict_tile(
     device = next(model.parameters()).device
     with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
         raw = model(lr.to(device), scale)[0]
-    local = activate(raw.float(), (y1 - y0, x1 - x0))
     per_pixel = model.config.decoder.gaussians_per_pixel**0.5  # along a side
     inside_x = _core(x0, x1, tile.x0, tile.x1, width, per_pixel)
     inside_y = _core(y0, y1, tile.y0, tile.y1, height, per_pixel)
-    kept = local[(inside_y[:, None] & inside_x[None, :]).flatten().to(device)]
+    inside = (inside_y[:, None] & inside_x[None, :]).flatten().to(device)
+    kept = activate(raw.float()[inside], (y1 - y0, x1 - x0))
     return replace(
         kept,
         mean=kept.mean + kept.mean.new_tensor([x0, y0]),
@@ -102,7 +103,7 @@ def predict_tile(
 def predict_tiles(
     model: GSASR,
     image: np.ndarray,
-    scale: float = 4.0,
+    scale: float = TOLD,
     tile: int = TILE,
     precision: str = "float32",
     near: tuple[float, float] | None = None,
@@ -168,7 +169,7 @@ def out_of_memory(error: Exception) -> bool:
 def predict(
     model: GSASR,
     image: np.ndarray,
-    scale: float = 4.0,
+    scale: float = TOLD,
     tile: int = TILE,
     precision: str = "float32",
     progress: Callable[[float], None] = lambda share: None,

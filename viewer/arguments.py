@@ -10,7 +10,7 @@ from typing import NoReturn
 from gsasr.errors import RequestError
 
 from .loading import check_path
-from .state import CONDITION, OVERLAYS, SIGMA
+from .state import CONDITION, OVERLAYS, SIGMA, TOLD
 
 
 class _Parser(argparse.ArgumentParser):
@@ -29,9 +29,9 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--condition",
         type=_number,
-        default=CONDITION[1],
+        default=TOLD,
         metavar="SCALE",
-        help=f"scale that the network predicts for, {CONDITION[0]:g} to {CONDITION[1]:g} (4)",
+        help=f"scale that the network is told, {CONDITION[0]:g} to {CONDITION[1]:g} ({TOLD:g})",
     )
     parser.add_argument(
         "--size", type=_size, default=(1280, 800), metavar="WxH", help="of the window or snapshot"

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 OVERLAYS = ("none", "centers", "ellipses")
 SIGMA = (0.5, 4.0)  # least and greatest size of the drawn ellipses, standard deviations
 CONDITION = (1.0, 4.0)  # scales that the networks are trained for
+TOLD = 3.0  # the one told by default, as in gsasr.predict, which would load PyTorch
 
 Rectangle = tuple[int, int, int, int]  # x0, y0, x1, y1 in source pixels
 
@@ -70,7 +71,7 @@ class State:
     """Settings and what is on screen."""
 
     model: str = "lite"
-    condition: float = CONDITION[1]
+    condition: float = TOLD
     overlay: str = "none"
     sigma: float = 2.0
     document: Document | None = None

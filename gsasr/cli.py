@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import NoReturn
 
 from .errors import GsasrError, RequestError
-from .memory import require_picture
+from .memory import out_of_memory, require_picture
+from .processor import DEVICES, PRECISIONS, chosen_device
 from .rasterize import BACKENDS
 from .training.commands import add_commands
 
@@ -35,8 +36,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"gsasr: {error}", file=sys.stderr)
         return 2
     except (MemoryError, RuntimeError) as error:
-        if isinstance(error, RuntimeError) and "allocate memory" not in str(error):
-            raise  # the other is PyTorch's way of saying the same
+        if not out_of_memory(error):
+            raise
         print("gsasr: Not enough memory; use a smaller scale or a region.", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -153,15 +154,6 @@ def evaluate(options: argparse.Namespace) -> None:
         print(table(scores, options.per_image), end="\n\n")
 
 
-def chosen_device(name: str) -> str:
-    """The device for --device; "auto" is a card if PyTorch has one."""
-    import torch
-
-    if name == "cuda" and not torch.cuda.is_available():
-        raise RequestError("PyTorch finds no NVIDIA GPU; use --device cpu.")
-    return ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
-
-
 def given_tile(options: argparse.Namespace) -> dict[str, int]:
     """--tile as a keyword argument, if it was given."""
     return {"tile": options.tile} if "tile" in options else {}
@@ -254,13 +246,11 @@ def parser() -> argparse.ArgumentParser:
     def add_prediction(command: argparse.ArgumentParser) -> None:
         command.add_argument(
             "--precision",
-            choices=("float32", "bfloat16"),
+            choices=PRECISIONS,
             default="float32",
             help="of the network; bfloat16 is faster where the processor has it",
         )
-        command.add_argument(
-            "--device", choices=("auto", "cpu", "cuda"), default="auto", help="of the network"
-        )
+        command.add_argument("--device", choices=DEVICES, default="auto", help="of the network")
 
     def add_tile(command: argparse.ArgumentParser) -> None:
         command.add_argument(

@@ -1,4 +1,4 @@
-"""Refusing work that cannot fit in memory, before it starts."""
+"""Refusing work that cannot fit in memory before it starts, and telling when it did not."""
 
 from __future__ import annotations
 
@@ -38,3 +38,10 @@ def _require(needed: int, what: str) -> None:
             f"{what} needs {needed / 2**30:.1f} GiB, but {available() / 2**30:.1f} GiB are free; "
             "use a smaller scale, region or picture."
         )
+
+
+def out_of_memory(error: Exception) -> bool:
+    """Whether this is how Python, PyTorch or its CPU allocator say that memory is exhausted."""
+    # By name, since only those who have loaded PyTorch can have met its error.
+    of_a_card = type(error).__name__ == "OutOfMemoryError"
+    return isinstance(error, MemoryError) or of_a_card or "allocate memory" in str(error)

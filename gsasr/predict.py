@@ -19,15 +19,15 @@ import torch
 
 from .errors import Cancelled, RequestError
 from .gaussians import Gaussians
-from .memory import require_field
+from .memory import out_of_memory, require_field
 from .model import GSASR, activate
+from .processor import PRECISIONS
 
 TILE = 256  # side of a core, source pixels, rounded to the network's multiple
 HALO = 16  # rounded likewise; what a tile does not see beyond it changes no 8-bit level
 BEYOND = 4  # source pixels past the picture's edge whose Gaussians still reach inside
 TOLD = 3.0  # conditioning scale by default: what it costs is in docs/prediction.md
 SCALES = (0.1, 1000.0)  # conditioning scales that a network can be told
-PRECISIONS = ("float32", "bfloat16")
 
 
 @dataclass(frozen=True)
@@ -157,13 +157,6 @@ def _easier(model: GSASR, pending: deque[Tile]) -> deque[Tile]:
     warnings.warn("Out of GPU memory: going on with the CPU.", stacklevel=3)
     model.to("cpu")
     return pending
-
-
-def out_of_memory(error: Exception) -> bool:
-    """Whether this is how Python, PyTorch or its CPU allocator say that memory is exhausted."""
-    return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or "allocate memory" in str(
-        error
-    )
 
 
 def predict(

@@ -35,3 +35,17 @@ def one(mean, std, rho=0.0, color=(1.0, 1.0, 1.0), opacity=1.0, size=(1, 1)) -> 
         opacity=torch.tensor([opacity], dtype=torch.float32),
         size=size,
     )
+
+
+# What a rasterizer may stumble over, each around a picture of one pixel.
+EXTREMES = {
+    "point": one((0.5, 0.5), (1e-6, 1e-6)),
+    "line": one((0.3, 0.7), (1e-6, 0.5)),
+    "ridge": one((0.5, 0.5), (0.5, 0.3), rho=0.999999),
+    "other ridge": one((0.5, 0.5), (0.3, 0.5), rho=-0.999999),
+    "outside": one((-50.0, 80.0), (0.8, 0.8)),
+    "huge": one((0.5, 0.5), (40.0, 40.0)),
+    "far": one((-1e12, 0.5), (1e12, 1e12)),
+    "invisible": one((0.5, 0.5), (0.5, 0.5), opacity=0.0),
+    "none": random_field(0, (1, 1)),
+}

@@ -9,7 +9,8 @@ from gsasr import image
 from gsasr.errors import Cancelled, RequestError
 from gsasr.model import GSASR, activate, load_model
 from gsasr.picture import conditioning_scale, render, resample_alpha, upscale
-from gsasr.predict import PRECISIONS, plan, predict, predict_tile, predict_tiles
+from gsasr.predict import plan, predict, predict_tile, predict_tiles
+from gsasr.processor import PRECISIONS
 from gsasr.rasterize import reference
 from gsasr.view import View
 

@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from fields import one, random_field
+from fields import EXTREMES, one, random_field
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors import safe_open
@@ -72,20 +72,7 @@ def test_cpu_agrees_with_the_oracle_in_any_region(view):
     assert difference < 1e-4
 
 
-@pytest.mark.parametrize(
-    "field",
-    [
-        one((0.5, 0.5), (1e-6, 1e-6)),
-        one((0.3, 0.7), (1e-6, 0.5)),
-        one((0.5, 0.5), (0.5, 0.3), rho=0.999999),
-        one((0.5, 0.5), (0.3, 0.5), rho=-0.999999),
-        one((-50.0, 80.0), (0.8, 0.8)),
-        one((0.5, 0.5), (40.0, 40.0)),
-        one((0.5, 0.5), (0.5, 0.5), opacity=0.0),
-        random_field(0, (1, 1)),
-    ],
-    ids=["point", "line", "ridge", "other ridge", "outside", "huge", "invisible", "none"],
-)
+@pytest.mark.parametrize("field", EXTREMES.values(), ids=EXTREMES.keys())
 @pytest.mark.parametrize("scale", [1, 4, 31])
 def test_cpu_agrees_with_the_oracle_on_extremes(field, scale):
     view = View.at_scale((1, 1), scale)

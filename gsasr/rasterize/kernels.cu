@@ -43,25 +43,15 @@ struct Range {
 #define SQRT_HALF_LOG2E 0.84932180028801904f  // s of gaussian.glsl
 #define SQRT_2_LN2 1.17741002251547469f       // 1 / s
 
-// The last of `count` pictures whose first Gaussian is at most n.
-__device__ inline int picture_of_gaussian(const Picture* pictures, int count, long long n)
+// The last of `count` pictures whose first Gaussian or tile (`start`) is at most n. One without any
+// shares its number with the next one, which wins.
+__device__ inline int picture_of(
+    const Picture* pictures, int count, long long Picture::*start, long long n)
 {
     int low = 0;
     for (int high = count; high - low > 1;) {
         int middle = (low + high) / 2;
-        if (pictures[middle].gaussian <= n) low = middle;
-        else high = middle;
-    }
-    return low;
-}
-
-// The same by tile. A picture without tiles shares its number with the next one, which wins.
-__device__ inline int picture_of_tile(const Picture* pictures, int count, long long tile)
-{
-    int low = 0;
-    for (int high = count; high - low > 1;) {
-        int middle = (low + high) / 2;
-        if (pictures[middle].tile <= tile) low = middle;
+        if (pictures[middle].*start <= n) low = middle;
         else high = middle;
     }
     return low;
@@ -115,7 +105,7 @@ extern "C" __global__ void project(
 {
     long long n = THREAD;
     if (n >= count) return;
-    const Picture& picture = pictures[picture_of_gaussian(pictures, picture_count, n)];
+    const Picture& picture = pictures[picture_of(pictures, picture_count, &Picture::gaussian, n)];
     double x = ((double)mean[2 * n] - picture.origin_x) * picture.scale_x - 0.5;
     double y = ((double)mean[2 * n + 1] - picture.origin_y) * picture.scale_y - 0.5;
     float std_x = (float)(std[2 * n] * picture.scale_x);
@@ -161,7 +151,7 @@ extern "C" __global__ void fill(
     long long n = start + THREAD;
     if (n >= stop || splats[n].limit < 0.0f) return;
     Splat splat = splats[n];
-    const Picture& picture = pictures[picture_of_gaussian(pictures, picture_count, n)];
+    const Picture& picture = pictures[picture_of(pictures, picture_count, &Picture::gaussian, n)];
     Range rows = rows_of(splat, picture.height);
     Range columns = columns_of(splat, picture.width);
     long long entry = (n ? ends[n - 1] : 0) - (start ? ends[start - 1] : 0);
@@ -187,7 +177,7 @@ extern "C" __global__ void gather(
     long long cell = strip / (across * tile);
     int inside = (int)(strip % (across * tile));
     if (first[cell] == first[cell + 1]) return;
-    const Picture& picture = pictures[picture_of_tile(pictures, picture_count, cell)];
+    const Picture& picture = pictures[picture_of(pictures, picture_count, &Picture::tile, cell)];
     int local = (int)(cell - picture.tile);
     int x = local % picture.across * tile + inside % across * STRIP;
     int y = local / picture.across * tile + inside / across;
@@ -236,7 +226,7 @@ extern "C" __global__ void backward(
         for (int i = 0; i < 8; ++i) out[i] = 0.0f;
         return;
     }
-    const Picture& picture = pictures[picture_of_gaussian(pictures, picture_count, n)];
+    const Picture& picture = pictures[picture_of(pictures, picture_count, &Picture::gaussian, n)];
     float red = 0.0f, green = 0.0f, blue = 0.0f;
     float sum_u = 0.0f, sum_v = 0.0f, sum_uu = 0.0f, sum_uv = 0.0f, sum_vv = 0.0f;
     Range rows = rows_of(splat, picture.height);

@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..errors import RequestError
+from ..processor import DEVICES, PRECISIONS
 
-DEVICES = ("auto", "cpu", "cuda")
 OPTIMIZERS = ("adam", "muon")
-PRECISIONS = ("float32", "bfloat16")
 
 
 def _setting(default: Any, text: str, choices: tuple[str, ...] | None = None) -> Any:

@@ -13,6 +13,7 @@ import torch
 import torch.distributed as dist
 
 from ..errors import BackendError, DataError, RequestError
+from ..processor import chosen_device
 
 PLACE = {"WORLD_SIZE": "1", "RANK": "0", "LOCAL_RANK": "0"}  # of torchrun, with what lone runs have
 PATIENCE = timedelta(hours=1)  # how long the others wait while the first one validates
@@ -97,13 +98,8 @@ def joined(device: str) -> Iterator[Group]:
 
 
 def _device(name: str, local_rank: int) -> torch.device:
-    there = torch.cuda.is_available()
-    if name == "auto":
-        name = "cuda" if there else "cpu"
-    if name == "cpu":
+    if chosen_device(name) == "cpu":
         return torch.device("cpu")
-    if not there:
-        raise BackendError("PyTorch finds no NVIDIA card here; use --device cpu.")
     cards = torch.cuda.device_count()
     if local_rank >= cards:
         raise BackendError(f"There are {cards} cards; start at most {cards} processes here.")

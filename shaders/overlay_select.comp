@@ -2,10 +2,10 @@
 // Copies the Gaussians of a tile that the view shows into a list of marks, ready for one draw call.
 
 #include "overlay.glsl"
+#include "records.glsl"
 
 layout(local_size_x = 64) in;
 
-layout(std430, binding = 0) readonly buffer Records { vec4 records[]; };  // see rasterize.comp
 layout(std430, binding = 1) writeonly buffer Marks { Mark marks[]; };
 layout(std430, binding = 2) buffer Command { uint vertices, instances, first, base; };
 
@@ -21,15 +21,15 @@ void main()
 {
     uint n = gl_GlobalInvocationID.x;
     if (n >= uint(count)) return;
-    vec4 head = records[2u * n], tail = records[2u * n + 1u];
-    vec2 centre = ((head.xy - base_origin) - origin) * scale;
+    Record r = record(n + 1u);
+    vec2 centre = ((r.mean - base_origin) - origin) * scale;
     // u = a dx + b dy and v = c dy, solved for dx and dy on the circle of this radius
-    float c = radius / tail.x * scale.y;
-    float a = radius / head.z * scale.x;
-    float b = -head.w / tail.x * a;
+    float c = radius / r.whiten.z * scale.y;
+    float a = radius / r.whiten.x * scale.x;
+    float b = -r.whiten.y / r.whiten.z * a;
     vec2 reach = vec2(length(vec2(a, b)), c) + margin;
     if (any(lessThan(centre + reach, vec2(0.0))) || any(greaterThan(centre - reach, size))) return;
     uint slot = atomicAdd(instances, 1u);
-    marks[slot] = Mark(vec4(centre, a, b), vec4(c, tail.yzw));
+    marks[slot] = Mark(vec4(centre, a, b), vec4(c, r.peak));
     if (radius > 0.0) atomicMax(vertices, 2u * uint(segments(max(reach.x, reach.y)) + 1));
 }

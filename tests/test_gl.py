@@ -10,7 +10,7 @@ import torch
 
 from gsasr.errors import BackendError, RequestError
 from gsasr.gaussians import Gaussians
-from gsasr.rasterize import gl, reference, tiles
+from gsasr.rasterize import blocks, cells, gl, opengl, reference, tiles
 from gsasr.view import View
 
 TOLERANCE = {"screen": 1e-3, "export": 1e-4}
@@ -155,7 +155,7 @@ def test_several_tiles_sum_to_the_picture_of_one(rasterizer):
     view = View.at_scale(gaussians.size, 5)
     expected = reference.render(gaussians, view).numpy()
     parts = tiles.split_tiles(gaussians, side=16)
-    assert len(parts) > 12
+    assert len(parts) == 12
     assert sum(len(part) for part in parts) == len(gaussians)
     uploaded = [rasterizer.upload(part, "export") for part in parts]
     assert np.abs(draw(rasterizer, uploaded, view) - expected).max() < 1e-4
@@ -186,14 +186,71 @@ def test_rows_can_be_drawn_by_themselves(rasterizer):
     np.testing.assert_allclose(drawn, draw(rasterizer, [tile], view), atol=1e-5)
 
 
-def test_both_ways_to_cover_cells_agree_with_the_reference(rasterizer):
+@pytest.mark.parametrize("shape", [blocks.SOFTWARE, blocks.HARDWARE], ids=["software", "hardware"])
+@pytest.mark.parametrize("quality", ["screen", "export"])
+def test_every_block_and_cell_draws_the_same_picture(gl_context, monkeypatch, shape, quality):
     gaussians = random_gaussians()
     view = View((0.3, 0.2), (9.0, 9.0), (150, 200))
     expected = reference.render(gaussians, view).numpy()
+    rasterizer = gl.GlRasterizer(gl_context, shape)
+    tile = rasterizer.upload(gaussians, quality)
+    for level in tile.levels:
+        for block in shape.blocks:
+            monkeypatch.setattr(blocks, "choose", lambda *_, c=(level.side, block): c)
+            drawn = draw(rasterizer, [tile], view)
+            assert np.abs(drawn - expected).max() < TOLERANCE[quality]
+    rasterizer.release()
+
+
+def test_entries_of_32_bits_draw_the_same_picture(rasterizer, monkeypatch):
+    gaussians = random_gaussians()
+    view = View((0.3, 0.2), (9.0, 9.0), (150, 200))
+    monkeypatch.setattr(cells, "SHORT", 20)
     tile = rasterizer.upload(gaussians, "export")
-    for shapes in (gl.SOFTWARE_SHAPES, gl.HARDWARE_SHAPES):
-        rasterizer._shapes = shapes
-        assert np.abs(draw(rasterizer, [tile], view) - expected).max() < 1e-4
+    assert any(level.wide for level in tile.levels)
+    expected = reference.render(gaussians, view).numpy()
+    assert np.abs(draw(rasterizer, [tile], view) - expected).max() < 1e-4
+
+
+def test_records_are_short_for_the_screen_only_where_their_range_suffices(rasterizer):
+    usual = random_gaussians()
+    view = View.at_scale(usual.size, 5)
+    for gaussians, quality, packed in (
+        (usual, "screen", True),
+        (usual, "export", False),
+        (Gaussians.concatenate([usual, one(std=(1e-5, 1.0))]), "screen", False),
+        (Gaussians.concatenate([usual, one(std=(1e5, 1e5), opacity=0.1)]), "screen", False),
+    ):
+        tile = rasterizer.upload(gaussians, quality)
+        assert (tile.unpacking is not None) == packed
+        expected = reference.render(gaussians, view).numpy()
+        assert np.abs(draw(rasterizer, [tile], view) - expected).max() < TOLERANCE[quality]
+
+
+def test_a_gaussian_takes_at_most_64_bytes_at_16_per_pixel():
+    rng = torch.Generator().manual_seed(0)
+    count = 16 * 96 * 96
+    field = Gaussians(
+        mean=96 * torch.rand(count, 2, generator=rng),
+        std=0.2 + 0.35 * torch.rand(count, 2, generator=rng),
+        rho=1.6 * torch.rand(count, generator=rng) - 0.8,
+        color=torch.rand(count, 3, generator=rng),
+        opacity=torch.full((count,), 0.1),
+        size=(96, 96),
+    )
+    (part,) = tiles.split_tiles(field)
+    packed = tiles.pack(part)
+    lists = sum(level.lists.nbytes + level.entries.nbytes for level in packed.levels)
+    assert (packed.records.data.nbytes + lists) / count < 64
+
+
+def test_the_cheapest_cells_and_blocks_grow_with_what_a_pixel_sees():
+    loads = [blocks.Load(1.0, 190, 0), blocks.Load(2.0, 320, 5), blocks.Load(4.0, 700, 300)]
+    sides, sizes = zip(
+        *(blocks.choose(loads, scale, blocks.SOFTWARE) for scale in (1, 2, 6, 8, 10)), strict=True
+    )
+    assert sides == (4.0, 2.0, 1.0, 1.0, 1.0)
+    assert sizes == (4, 4, 6, 8, 10)
 
 
 def test_a_target_of_another_size_is_refused(rasterizer):
@@ -224,12 +281,13 @@ def test_drawing_causes_no_error_of_the_driver(gl_context, rasterizer):
 
 def test_warming_up_compiles_every_program_and_draws_nothing(gl_context, rasterizer):
     rasterizer.warm_up("f4")
-    assert len(rasterizer._programs) == len(rasterizer._shapes)
+    compiled = len(rasterizer.shape.blocks) + 1
+    assert len(rasterizer._programs) == compiled
     gaussians = random_gaussians()
     view = View.at_scale(gaussians.size, 3)
     drawn = draw(rasterizer, [rasterizer.upload(gaussians)], view)
     assert np.abs(drawn - reference.render(gaussians, view).numpy()).max() < 1e-3
-    assert len(rasterizer._programs) == len(rasterizer._shapes)
+    assert len(rasterizer._programs) == compiled
     assert gl_context.error == "GL_NO_ERROR"
 
 
@@ -239,7 +297,7 @@ def test_runs_cover_every_pixel_once_and_stay_inside_a_cell():
         origin, scale = rng.uniform(-50, 4000), float(np.exp(rng.uniform(-3, 8)))
         start, stop = sorted(rng.integers(0, 300, 2).tolist())
         side, longest = float(rng.choice([1, 2, 4])), int(rng.integers(1, 17))
-        made = gl.runs(origin, scale, start, stop, side, longest)
+        made = blocks.runs(origin, scale, start, stop, side, longest)
         assert made["count"].sum() == stop - start
         assert (np.diff(made["cell"]) >= 0).all()
         for pixel, count, cell, offset in made.tolist():
@@ -247,7 +305,8 @@ def test_runs_cover_every_pixel_once_and_stay_inside_a_cell():
             last = origin + (pixel + count - 0.5) / scale
             first = origin + (pixel + 0.5) / scale
             assert np.floor(first / side) == np.floor(last / side) == cell
-            assert offset == pytest.approx(first - cell * side, abs=1e-5)
+            middle = origin + (pixel + count // 2 + 0.5) / scale
+            assert offset == pytest.approx(middle - cell * side, abs=1e-5)
         np.testing.assert_array_equal(
             np.concatenate([np.arange(p, p + n) for p, n, *_ in made.tolist()] or [[]]),
             np.arange(start, stop),
@@ -285,7 +344,7 @@ def test_a_machine_without_opengl_is_told_what_to_do(monkeypatch):
     def refuse(**_):
         raise Exception("cannot create context")
 
-    monkeypatch.setattr(gl.moderngl, "create_context", refuse)
+    monkeypatch.setattr(opengl.moderngl, "create_context", refuse)
     with pytest.raises(BackendError, match="--backend cpu"):
         gl.create_context()
     gl.hardware.cache_clear(), gl.driver.cache_clear()

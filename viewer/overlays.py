@@ -10,7 +10,7 @@ import numpy as np
 
 from gsasr.errors import RequestError
 from gsasr.rasterize.gl import GlTile, load_shader
-from gsasr.rasterize.tiles import FOLD
+from gsasr.rasterize.records import FOLD
 from gsasr.view import View
 
 Kind = Literal["centers", "ellipses"]
@@ -28,7 +28,10 @@ class Overlays:
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self.ctx = ctx
-        self._select = ctx.compute_shader(load_shader(ctx, "overlay_select.comp"))
+        self._select = {
+            packed: ctx.compute_shader(load_shader(ctx, "overlay_select.comp", defines))
+            for packed, defines in ((False, {}), (True, {"PACKED": 1}))
+        }
         self._programs = {
             kind: ctx.program(
                 vertex_shader=load_shader(ctx, f"overlay_{kind}.vert"),
@@ -92,7 +95,7 @@ class Overlays:
     def release(self) -> None:
         """Free the programs and buffers (not the tiles, nor the context)."""
         held = (*self._arrays.values(), *self._programs.values(), self._marks, self._command)
-        for each in (*held, self._select):
+        for each in (*held, *self._select.values()):
             each.release()
 
     def _reserve(self, count: int) -> None:
@@ -113,7 +116,9 @@ class Overlays:
         self.ctx.memory_barrier()  # the draw call before may still read both
         self._command.write(np.array([4 if sigma == 0.0 else 0, 0, 0, 0, 0], np.uint32))
         base = tuple(math.floor(v) for v in view.origin)
-        select = self._select
+        select = self._select[tile.unpacking is not None]
+        if tile.unpacking is not None:
+            select["unpacking"] = tile.unpacking
         select["count"] = tile.count
         select["base_origin"] = base[0] - tile.origin[0], base[1] - tile.origin[1]
         select["origin"] = view.origin[0] - base[0], view.origin[1] - base[1]

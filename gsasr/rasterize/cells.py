@@ -13,130 +13,257 @@ import numpy as np
 
 from ..errors import FieldError
 from .jit import jit
+from .records import narrow
 
-ENTRIES_PER_GAUSSIAN = 48  # beyond this (large Gaussians) the cells grow, so memory stays bounded
+ENTRIES_PER_GAUSSIAN = 30  # beyond this (large Gaussians) cells grow, so memory stays bounded
 CELLS_PER_GAUSSIAN = 4  # likewise for sparse Gaussians
 FEW = 1 << 16  # cells or entries that are fine however few the Gaussians
-# Standard deviations from the middle of a cell beyond which 2^-(u^2 + v^2) leaves float32, so
-# that a Gaussian cannot be followed along a row by multiplication: 0.5 log2(e) 12.6^2 = 114.
+SHORT = (1 << 16) - 1  # the greatest entry of 16 bits
+# Standard deviations from the middle of a block of pixels beyond which 2^-(u^2 + v^2) leaves
+# float32, so that a Gaussian cannot be followed from there: 0.5 log2(e) 12.6^2 = 114.
 STEEP = 12.6
 
 
 @dataclass(frozen=True)
 class Cells:
-    """Lists of Gaussians per square cell of a grid over the source image (CSR).
+    """Lists of Gaussians per square cell of a grid over the source image.
 
     side: of a cell, source pixels, a power of two.
     first: (x, y) of the grid's first cell: it covers [x * side, (x + 1) * side) and so on.
     shape: (rows, columns) of the grid; it covers every footprint, also outside the picture.
-    offsets: (2 * rows * columns + 1,) uint32; cell i (row-major) has two lists, its ordinary
-        Gaussians entries[offsets[2i] : offsets[2i + 1]] and its steep ones
-        entries[offsets[2i + 1] : offsets[2i + 2]].
-    entries: (E,) uint32, Gaussian indices, ascending within a list.
+    lists: (3 * rows * columns + 1,) uint32; of cell i (row-major): where its ordinary Gaussians
+        begin, where its steep ones do, both in pairs of entries, and its base. The next cell's
+        first number is where they end.
+    entries: pairs of uint16 (or uint32, where bases and these would not do): entry e > 0 of a
+        cell is the Gaussian base + e - 1, ascending within a list; 0 is none, and fills a pair.
+    count: entries that are not 0; steep: how many of those are in steep lists.
     """
 
     side: float
     first: tuple[int, int]
     shape: tuple[int, int]
-    offsets: np.ndarray
+    lists: np.ndarray
     entries: np.ndarray
+    count: int
+    steep: int
+
+    @property
+    def wide(self) -> bool:
+        """Do entries have 32 bits?"""
+        return self.entries.dtype == np.uint32
 
 
 def build(
-    mean: np.ndarray, std: np.ndarray, rho: np.ndarray, cut: np.ndarray, side: float = 1.0
-) -> Cells:
-    """Cells of at least `side` source pixels; a Gaussian is listed where q <= cut meets the cell.
+    mean: np.ndarray,
+    std: np.ndarray,
+    rho: np.ndarray,
+    cut: np.ndarray,
+    sides: tuple[float, ...] = (1.0,),
+) -> list[Cells]:
+    """One index per side (source pixels; powers of two, ascending) of the ellipses q <= cut.
 
     mean, std: (N, 2), source pixels; rho, cut: (N,); a Gaussian with a negative cut is nowhere.
-    The test is exact (ellipse against cell); the cells double in size until the lists are short.
+    The test is exact (ellipse against cell). Where Gaussians are so large or so few that lists or
+    grids would grow out of proportion, the finest cells are larger; at least one index is made.
     """
     mean, std, rho, cut = (np.ascontiguousarray(a, np.float64) for a in (mean, std, rho, cut))
-    narrow = std[:, 0] * np.sqrt(1 - rho**2)  # standard deviation along a row
+    if not (cut >= 0).any():
+        nothing = np.zeros(1, np.uint32), np.zeros(0, np.uint16)
+        return [Cells(float(sides[0]), (0, 0), (0, 0), *nothing, 0, 0)]
+    spans = _finest(mean, std, rho, cut, float(sides[0]))
+    levels = [_listed(spans, std, rho, cut)]
+    for side in sides:
+        if side > spans.side:
+            spans = _merged(spans, round(side / spans.side))
+            levels.append(_listed(spans, std, rho, cut))
+    return levels
+
+
+@dataclass(frozen=True)
+class _Spans:
+    """Which cells each Gaussian meets: in row row[n] + j the columns [start, stop) of
+    columns[begin[n] + j], for all j below begin[n + 1] - begin[n]."""
+
+    side: float
+    first: tuple[int, int]
+    shape: tuple[int, int]
+    row: np.ndarray
+    begin: np.ndarray
+    columns: np.ndarray
+
+
+def _finest(mean, std, rho, cut, side: float) -> _Spans:
+    """Spans of the smallest cells, `side` or larger, whose lists stay short."""
     drawn = cut >= 0
-    if not drawn.any():
-        return Cells(side, (0, 0), (0, 0), np.zeros(1, np.uint32), np.zeros(0, np.uint32))
-    extent = np.sqrt(np.maximum(cut, 0))
-    reach = extent[drawn, None] * std[drawn]
+    reach = np.sqrt(cut[drawn])[:, None] * std[drawn]
     low, high = (mean[drawn] - reach).min(axis=0), (mean[drawn] + reach).max(axis=0)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise FieldError("The Gaussians hold values that are not finite; predict the field anew.")
+    most = max(FEW, ENTRIES_PER_GAUSSIAN * len(cut))
+    row, begin = np.zeros(len(cut), np.int32), np.zeros(len(cut) + 1, np.int64)
     while True:
-        first, last = np.floor(low / side), np.floor(high / side)
-        columns, rows = last - first + 1
-        if rows * columns <= max(FEW, CELLS_PER_GAUSSIAN * len(cut)):
-            counts = np.zeros((int(rows), int(columns), 2), np.int64)
-            steep = (side / (2 * narrow) + extent > STEEP).astype(np.int64)
-            _count(mean, std, rho, cut, steep, side, first, counts)
-            if counts.sum() <= max(FEW, ENTRIES_PER_GAUSSIAN * len(cut)):
-                break
+        first = np.floor(low / side)
+        across, down = np.floor(high / side) - first + 1
+        if across * down <= max(FEW, CELLS_PER_GAUSSIAN * len(cut)):
+            _rows(mean, std, cut, side, first[1], int(down), row, begin)
+            if begin[-1] <= most:
+                columns = np.empty((begin[-1], 2), np.int32)
+                span = int(across)
+                if _columns(mean, std, rho, cut, side, first, span, row, begin, columns) <= most:
+                    corner = (int(first[0]), int(first[1]))
+                    return _Spans(side, corner, (int(down), span), row, begin, columns)
         side *= 2
-    offsets = np.zeros(counts.size + 1, np.int64)
-    np.cumsum(counts.ravel(), out=offsets[1:])
-    entries = np.empty(offsets[-1], np.uint32)
-    cursor = offsets[:-1].copy().reshape(counts.shape)
-    _fill(mean, std, rho, cut, steep, side, first, cursor, entries)
-    corner = (int(first[0]), int(first[1]))
-    return Cells(float(side), corner, counts.shape[:2], offsets.astype(np.uint32), entries)
+
+
+def _merged(fine: _Spans, times: int) -> _Spans:
+    """The spans in cells `times` as large: a large cell is met where one of its small ones is."""
+    first = fine.first[0] // times, fine.first[1] // times
+    shift = tuple(f - c * times for f, c in zip(fine.first, first, strict=True))
+    shape = -(-(fine.shape[0] + shift[1]) // times), -(-(fine.shape[1] + shift[0]) // times)
+    row, begin = np.empty_like(fine.row), np.empty_like(fine.begin)
+    columns = np.empty_like(fine.columns)
+    used = _merge(fine.row, fine.begin, fine.columns, *shift, times, row, begin, columns)
+    return _Spans(fine.side * times, first, shape, row, begin, columns[:used].copy())
+
+
+def _listed(spans: _Spans, std, rho, cut) -> Cells:
+    """The lists of all cells."""
+    cells = spans.shape[0] * spans.shape[1]
+    steep = np.empty(len(cut), np.uint8)
+    _mark_steep(std, rho, cut, spans.side, steep)
+    counts = np.zeros((cells, 2), np.int32)
+    base, last = np.zeros(cells, np.uint32), np.zeros(cells, np.uint32)
+    where = (spans.row, spans.begin, spans.columns, spans.shape[1], steep)
+    _count(*where, counts, base, last)
+    lists = np.zeros(3 * cells + 1, np.uint32)
+    pairs = _place(counts, base, lists)
+    wide = bool((last - base >= SHORT).any())
+    entries = np.zeros(2 * pairs, np.uint32 if wide else np.uint16)
+    _fill(*where, lists, np.zeros((cells, 2), np.uint32), entries)
+    count, steeps = counts.sum(axis=0, dtype=np.int64)
+    return Cells(
+        spans.side, spans.first, spans.shape, lists, entries, int(count + steeps), int(steeps)
+    )
 
 
 @jit
-def _columns(mean, std, rho, cut, n, y0, y1):
-    """Least and greatest x of ellipse n within y0 <= y <= y1; (1, 0) if they do not meet.
+def _rows(mean, std, cut, side, first, down, row, begin):
+    """The rows of cells that each ellipse meets; (1, 0) if they do not meet."""
+    for n in range(cut.shape[0]):
+        begin[n + 1] = begin[n]
+        if cut[n] >= 0.0:
+            reach = std[n, 1] * math.sqrt(cut[n])
+            start = max(math.floor((mean[n, 1] - reach) / side) - first, 0.0)
+            stop = min(math.floor((mean[n, 1] + reach) / side) - first + 1.0, float(down))
+            row[n] = int(start)
+            begin[n + 1] += int(stop) - int(start)
 
-    The ellipse is x = mean + std (rho t + root e), y = mean + std t with t^2 + e^2 <= cut, and
-    a convex shape meets exactly the cells of a row that its shadow on that row meets.
+
+@jit
+def _columns(mean, std, rho, cut, side, first, across, row, begin, columns):
+    """The columns in each of those rows, and how many cells that is in all.
+
+    With k^2 = cut, an ellipse is at height y the interval x = (rho sx / sy) y -+
+    sx sqrt((1 - rho^2) (k^2 - y^2 / sy^2)), and lies farthest to the right and to the left, at
+    k sx, where y = +-rho k sy. A convex shape meets exactly the cells of a row that its shadow
+    on that row meets.
     """
-    k = math.sqrt(cut[n])
-    t0 = max((y0 - mean[n, 1]) / std[n, 1], -k)
-    t1 = min((y1 - mean[n, 1]) / std[n, 1], k)
-    if t0 > t1:
-        return 1.0, 0.0
-    root = math.sqrt(1.0 - rho[n] * rho[n])
-    right = min(max(rho[n] * k, t0), t1)
-    left = min(max(-rho[n] * k, t0), t1)
-    x0 = rho[n] * left - root * math.sqrt(max(0.0, cut[n] - left * left))
-    x1 = rho[n] * right + root * math.sqrt(max(0.0, cut[n] - right * right))
-    return mean[n, 0] + std[n, 0] * x0, mean[n, 0] + std[n, 0] * x1
-
-
-@jit
-def _span(low, high, side, first, count):
-    """First and one past the last cell that [low, high] touches."""
-    start = np.floor(low / side) - first
-    stop = np.floor(high / side) - first + 1.0
-    return int(max(start, 0.0)), int(min(stop, float(count)))
-
-
-@jit
-def _count(mean, std, rho, cut, steep, side, first, counts):
+    total = 0
     for n in range(cut.shape[0]):
-        if not cut[n] >= 0.0:
+        if begin[n] == begin[n + 1]:
             continue
-        reach = std[n, 1] * math.sqrt(cut[n])
-        row0, row1 = _span(mean[n, 1] - reach, mean[n, 1] + reach, side, first[1], counts.shape[0])
-        for row in range(row0, row1):
-            y = (first[1] + row) * side
-            low, high = _columns(mean, std, rho, cut, n, y, y + side)
-            if low > high:
-                continue
-            column0, column1 = _span(low, high, side, first[0], counts.shape[1])
-            for column in range(column0, column1):
-                counts[row, column, steep[n]] += 1
+        x, y = mean[n, 0], mean[n, 1]
+        k = math.sqrt(cut[n])
+        reach_x, reach_y = k * std[n, 0], k * std[n, 1]
+        farthest = rho[n] * reach_y
+        root = math.sqrt(1.0 - rho[n] * rho[n])
+        # Lines between rows, from the ellipse's top to its bottom; t = y / (k sy)
+        upper, before, low, high = -reach_y, -1.0, -rho[n] * reach_x, -rho[n] * reach_x
+        for j in range(begin[n + 1] - begin[n]):
+            lower = min(max((first[1] + row[n] + j + 1) * side - y, -reach_y), reach_y)
+            t = lower / reach_y if reach_y > 0.0 else 1.0
+            half = reach_x * root * math.sqrt(max(0.0, 1.0 - t * t))
+            middle = rho[n] * reach_x * t
+            left, right = min(low, middle - half), max(high, middle + half)
+            if upper <= farthest <= lower:
+                right = reach_x
+            if upper <= -farthest <= lower:
+                left = -reach_x
+            start = max(math.floor((x + left) / side) - first[0], 0.0)
+            stop = min(math.floor((x + right) / side) - first[0] + 1.0, float(across))
+            columns[begin[n] + j, 0] = int(start)
+            columns[begin[n] + j, 1] = int(stop)
+            total += int(stop) - int(start)
+            upper, low, high = lower, middle - half, middle + half
+    return total
 
 
 @jit
-def _fill(mean, std, rho, cut, steep, side, first, cursor, entries):
+def _merge(row, begin, columns, shift_x, shift_y, times, new_row, new_begin, new_columns):
+    used = 0
+    new_begin[0] = 0
+    for n in range(row.shape[0]):
+        new_row[n] = (row[n] + shift_y) // times
+        previous = -1
+        for j in range(begin[n + 1] - begin[n]):
+            here = (row[n] + j + shift_y) // times
+            start = (columns[begin[n] + j, 0] + shift_x) // times
+            stop = (columns[begin[n] + j, 1] - 1 + shift_x) // times + 1
+            if here == previous:
+                new_columns[used - 1, 0] = min(new_columns[used - 1, 0], start)
+                new_columns[used - 1, 1] = max(new_columns[used - 1, 1], stop)
+            else:
+                new_columns[used, 0] = start
+                new_columns[used, 1] = stop
+                used += 1
+            previous = here
+        new_begin[n + 1] = used
+    return used
+
+
+@jit
+def _mark_steep(std, rho, cut, side, steep):
+    """Where half a cell's diagonal is too many standard deviations for STEEP."""
     for n in range(cut.shape[0]):
-        if not cut[n] >= 0.0:
-            continue
-        reach = std[n, 1] * math.sqrt(cut[n])
-        row0, row1 = _span(mean[n, 1] - reach, mean[n, 1] + reach, side, first[1], cursor.shape[0])
-        for row in range(row0, row1):
-            y = (first[1] + row) * side
-            low, high = _columns(mean, std, rho, cut, n, y, y + side)
-            if low > high:
-                continue
-            column0, column1 = _span(low, high, side, first[0], cursor.shape[1])
-            for column in range(column0, column1):
-                entries[cursor[row, column, steep[n]]] = n
-                cursor[row, column, steep[n]] += 1
+        root = math.sqrt(1.0 - rho[n] * rho[n])
+        least = narrow(std[n, 0], std[n, 1], root)
+        steep[n] = math.sqrt(max(0.0, cut[n])) + math.sqrt(0.5) * side / least > STEEP
+
+
+@jit
+def _count(row, begin, columns, across, steep, counts, base, last):
+    for n in range(row.shape[0]):
+        for j in range(begin[n + 1] - begin[n]):
+            line = (row[n] + j) * across
+            for column in range(columns[begin[n] + j, 0], columns[begin[n] + j, 1]):
+                cell = line + column
+                if counts[cell, 0] + counts[cell, 1] == 0:
+                    base[cell] = n
+                last[cell] = n
+                counts[cell, steep[n]] += 1
+
+
+@jit
+def _place(counts, base, lists):
+    """Where each list begins; returns how many pairs there are in all."""
+    pairs = 0
+    for cell in range(counts.shape[0]):
+        lists[3 * cell] = pairs
+        pairs += (counts[cell, 0] + 1) // 2
+        lists[3 * cell + 1] = pairs
+        pairs += (counts[cell, 1] + 1) // 2
+        lists[3 * cell + 2] = base[cell]
+    lists[3 * counts.shape[0]] = pairs
+    return pairs
+
+
+@jit
+def _fill(row, begin, columns, across, steep, lists, done, entries):
+    for n in range(row.shape[0]):
+        for j in range(begin[n + 1] - begin[n]):
+            line = (row[n] + j) * across
+            for column in range(columns[begin[n] + j, 0], columns[begin[n] + j, 1]):
+                cell = line + column
+                at = 2 * lists[3 * cell + steep[n]] + done[cell, steep[n]]
+                entries[at] = n - lists[3 * cell + 2] + 1
+                done[cell, steep[n]] += 1

@@ -3,7 +3,7 @@
 Dropping costs accuracy, so the cut is chosen per Gaussian such that everything dropped at a
 pixel adds up to less than the tolerance of the quality asked for:
 
-- "screen": below half an 8-bit step (1/510), with a margin of four;
+- "screen": below half an 8-bit step (1/510), with a margin of two;
 - "export": below 1e-4, with a margin of two;
 - "gradient": a fixed cut in standard deviations, whatever the opacity, so that a faint Gaussian
   still receives its gradient.
@@ -20,7 +20,7 @@ import torch
 
 from ..gaussians import Gaussians
 
-TOLERANCE = {"screen": 5e-4, "export": 5e-5}
+TOLERANCE = {"screen": 1e-3, "export": 5e-5}
 GRADIENT_CUT = 5.0**2  # tails of second moments: (1 + k^2/2) exp(-k^2/2) = 5e-5
 
 
@@ -45,9 +45,7 @@ def _densest(gaussians: Gaussians) -> float:
     """
     if len(gaussians) == 0:
         return 0.0
-    height, width = gaussians.size
-    column = gaussians.mean[:, 0].floor().clamp(0, width - 1).long()
-    row = gaussians.mean[:, 1].floor().clamp(0, height - 1).long()
+    column, row = gaussians.mean.detach().floor().clamp(-(2.0**30), 2.0**30).long().unbind(dim=1)
     std = gaussians.std.double()
     area = 2 * math.pi * std.prod(dim=1) * (1 - gaussians.rho.double() ** 2).clamp(min=0).sqrt()
     # Only the pixels around these Gaussians, which may be a small tile of a large picture.

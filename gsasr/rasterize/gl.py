@@ -7,8 +7,7 @@ cells of the source image (tiles.py, cells.py), and a frame of any zoom only rea
 from __future__ import annotations
 
 import functools
-import math
-from collections.abc import Sequence
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -17,9 +16,11 @@ import moderngl
 import numpy as np
 
 from ..errors import BackendError, RequestError
-from ..files import shipped
 from ..view import View
-from .tiles import CELL_SIDES, PackedTile, pack, split_tiles, visible
+from . import blocks
+from .blocks import HARDWARE, RUN, SOFTWARE, Load, Shape
+from .opengl import create_context, driver, hardware, load_shader, software
+from .tiles import PackedTile, pack, split_tiles, visible
 
 if TYPE_CHECKING:
     from ..gaussians import Gaussians
@@ -28,38 +29,19 @@ __all__ = [
     "GlRasterizer",
     "GlTile",
     "create_context",
+    "driver",
     "hardware",
     "load_shader",
     "pack",
     "render",
+    "software",
     "split_tiles",
 ]
 
-SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software rasterizer", "swiftshader")
 TARGETS = {"f2": "rgba16f", "f4": "rgba32f"}
 BLOCK = 4096  # widest piece that `render` draws at once, pixels
 PIXELS = 1 << 22  # most pixels in such a piece: 64 MiB
 HELD = 1 << 29  # bytes of tiles that `render` holds on the GPU at once, about
-
-RUN = np.dtype([("pixel", "i4"), ("count", "i4"), ("cell", "i4"), ("offset", "f4")])
-
-
-@dataclass(frozen=True)
-class Shape:
-    """How a workgroup covers a cell (see rasterize.comp); for cells of `reach` pixels or more."""
-
-    rows: int
-    runs: int
-    pixels: int
-    lines: int
-    reach: float
-
-
-# Software runs 8 threads in step and pays most for loading a Gaussian, so a thread covers as much
-# as it can, and all threads read the same list. A GPU wants many threads. Found by measuring
-# (benchmarks/gl_frame.py), for GPUs a guess.
-SOFTWARE_SHAPES = (Shape(8, 1, 16, 2, 9.0), Shape(8, 1, 8, 1, 6.0), Shape(2, 4, 2, 1, 2.0))
-HARDWARE_SHAPES = (Shape(8, 8, 8, 1, 6.0), Shape(2, 32, 2, 1, 2.0))
 
 
 @dataclass(frozen=True)
@@ -69,13 +51,16 @@ class GlLevel:
     side: float
     first: tuple[int, int]
     shape: tuple[int, int]
-    offsets: moderngl.Buffer
+    lists: moderngl.Buffer
     entries: moderngl.Buffer
+    wide: bool
+    ordinary: int  # entries in ordinary lists, and in steep ones
+    steep: int
 
 
 @dataclass(frozen=True)
 class GlTile:
-    """A PackedTile on the GPU. `count` Gaussians; the rest as in PackedTile."""
+    """A PackedTile on the GPU. `count` Gaussians; the rest as in PackedTile and Records."""
 
     count: int
     origin: tuple[int, int]
@@ -83,12 +68,13 @@ class GlTile:
     extent: tuple[float, float, float, float]
     largest: float
     records: moderngl.Buffer
+    unpacking: tuple[float, float, float] | None
     levels: tuple[GlLevel, ...]
 
     @property
     def nbytes(self) -> int:
         """Video memory it holds."""
-        lists = sum(level.offsets.size + level.entries.size for level in self.levels)
+        lists = sum(level.lists.size + level.entries.size for level in self.levels)
         return self.records.size + lists
 
     def meets(self, view: View) -> bool:
@@ -106,32 +92,60 @@ class GlTile:
         """Free the video memory; on the thread of the context."""
         self.records.release()
         for level in self.levels:
-            level.offsets.release()
+            level.lists.release()
             level.entries.release()
+
+
+@dataclass(frozen=True)
+class _Variant:
+    """Which of the programs made of rasterize.comp."""
+
+    target: str
+    block: int
+    steep: bool = False
+    packed: bool = True
+    wide: bool = False
+
+
+@dataclass(frozen=True)
+class _Runs:
+    """How a view is cut for one size of cells and of blocks (see blocks.runs)."""
+
+    buffer: moderngl.Buffer
+    columns: np.ndarray  # the cell of every run, ascending
+    lines: np.ndarray
 
 
 class GlRasterizer:
     """Draws tiles of Gaussians with a given context, on that context's thread."""
 
-    def __init__(self, ctx: moderngl.Context) -> None:
+    def __init__(self, ctx: moderngl.Context, shape: Shape | None = None) -> None:
+        """shape: what suits the device (see blocks.Shape), if not what its kind suggests."""
         self.ctx = ctx
-        self._shapes = SOFTWARE_SHAPES if software(ctx.info) else HARDWARE_SHAPES
-        self._programs: dict[tuple[Shape, str], moderngl.ComputeShader] = {}
-        self._runs: dict[tuple[float, Shape], moderngl.Buffer] = {}
+        self.shape = shape or (SOFTWARE if software(ctx.info) else HARDWARE)
+        self._programs: dict[_Variant, moderngl.ComputeShader] = {}
+        self._buffers: dict[tuple[float, int], moderngl.Buffer] = {}
 
     def warm_up(self, dtype: str = "f2") -> None:
-        """Compile all that `draw` will need for such a target, lest a first frame stutter.
+        """Compile all that `draw` usually needs for such a target, lest a first frame stutter.
 
         Some drivers, software among them, compile when a program first runs: so it runs.
         """
-        target = self.ctx.texture((1, 1), 4, dtype=dtype)
-        target.bind_to_image(0, read=True, write=True)
-        for shape in self._shapes:
-            program = self._program(shape, TARGETS[dtype])
-            program["window"] = 0, 0, 0  # no runs: every thread ends at once
+        for _ in self.warming(dtype):
+            pass
+
+    def warming(self, dtype: str = "f2") -> Iterator[None]:
+        """The same, one program per step."""
+        usual = [_Variant(TARGETS[dtype], block) for block in self.shape.blocks]
+        for variant in (*usual, _Variant(TARGETS[dtype], self.shape.steep, steep=True)):
+            target = self.ctx.texture((1, 1), 4, dtype=dtype)
+            target.bind_to_image(0, read=True, write=True)
+            program = self._program(variant)
+            program["window"] = 0, 0, 0, 0  # no runs: every thread ends at once
             program.run(1, 1)
-        self.ctx.finish()
-        target.release()
+            self.ctx.finish()
+            target.release()
+            yield
 
     def upload(self, tile: PackedTile | Gaussians, quality: str = "screen") -> GlTile:
         """The tile on the GPU. Gaussians are packed first, which is better done on a worker.
@@ -140,7 +154,7 @@ class GlRasterizer:
         """
         if not isinstance(tile, PackedTile):
             tile = pack(tile, quality)
-        arrays = [tile.records, *(a for c in tile.levels for a in (c.offsets, c.entries))]
+        arrays = [tile.records.data, *(a for c in tile.levels for a in (c.lists, c.entries))]
         # A buffer cannot be empty.
         buffers = [self.ctx.buffer(a) if a.size else self.ctx.buffer(reserve=32) for a in arrays]
         if self.ctx.error == "GL_OUT_OF_MEMORY":
@@ -150,11 +164,26 @@ class GlRasterizer:
                 "The GPU is out of memory; close other programs or use --backend cpu."
             )
         levels = tuple(
-            GlLevel(c.side, c.first, c.shape, *buffers[1 + 2 * i : 3 + 2 * i])
-            for i, c in enumerate(tile.levels)
+            GlLevel(
+                cells.side,
+                cells.first,
+                cells.shape,
+                *buffers[1 + 2 * i : 3 + 2 * i],
+                cells.wide,
+                cells.count - cells.steep,
+                cells.steep,
+            )
+            for i, cells in enumerate(tile.levels)
         )
         return GlTile(
-            len(tile), tile.origin, tile.bounds, tile.extent, tile.largest, buffers[0], levels
+            len(tile),
+            tile.origin,
+            tile.bounds,
+            tile.extent,
+            tile.largest,
+            buffers[0],
+            tile.records.unpacking,
+            levels,
         )
 
     def draw(
@@ -181,62 +210,71 @@ class GlRasterizer:
         if clear:
             self._clear(target, start, stop)
         target.bind_to_image(0, read=True, write=True)
-        axes: dict[tuple[float, Shape], tuple[np.ndarray, np.ndarray]] = {}
-        for tile in tiles:
-            if not tile.meets(view):
-                continue
-            index, shape = choose([level.side for level in tile.levels], view, self._shapes)
-            level = tile.levels[index]
-            if (level.side, shape) not in axes:
-                columns = runs(view.origin[0], view.scale[0], 0, width, level.side, shape.pixels)
-                lines = shape.rows * shape.lines
-                bands = runs(view.origin[1], view.scale[1], start, stop, level.side, lines)
-                axes[level.side, shape] = columns["cell"], bands["cell"]
-                self._upload_runs((level.side, shape), np.concatenate([columns, bands]))
-            self._draw_tile(tile, level, shape, view, target, *axes[level.side, shape])
-        self.ctx.memory_barrier()
+        kind = TARGETS[target.dtype]
+        cut: dict[tuple[float, int], _Runs] = {}
 
-    def side(self, view: View) -> float:
-        """The side of the cells that `draw` reads at this scale, source pixels: see pack."""
-        return CELL_SIDES[choose(CELL_SIDES, view, self._shapes)[0]]
+        def runs(side: float, block: int) -> _Runs:
+            if (side, block) not in cut:
+                cut[side, block] = self._cut(view, start, stop, side, block)
+            return cut[side, block]
+
+        for tile, level, block in self._plan([tile for tile in tiles if tile.meets(view)], view):
+            for entries, side, steep in (
+                (level.ordinary, block, False),
+                (level.steep, self.shape.steep, True),
+            ):
+                if entries:
+                    variant = _Variant(kind, side, steep, tile.unpacking is not None, level.wide)
+                    self._draw_tile(variant, tile, level, view, runs(level.side, side))
+        self.ctx.memory_barrier()
 
     def release(self) -> None:
         """Free the programs and buffers (not the tiles, nor the context)."""
-        for held in (*self._programs.values(), *self._runs.values()):
+        for held in (*self._programs.values(), *self._buffers.values()):
             held.release()
         self._programs.clear()
-        self._runs.clear()
+        self._buffers.clear()
 
     def _clear(self, target: moderngl.Texture, start: int, stop: int) -> None:
         framebuffer = self.ctx.framebuffer([target])
         framebuffer.clear(alpha=1.0, viewport=(0, start, target.width, stop - start))
         framebuffer.release()
 
-    def _upload_runs(self, key: tuple[float, Shape], data: np.ndarray) -> None:
-        buffer = self._runs.get(key)
+    def _plan(self, tiles: list[GlTile], view: View) -> Iterator[tuple[GlTile, GlLevel, int]]:
+        """Each tile with the index and the side of the blocks to draw it by."""
+        alike: dict[tuple[float, ...], list[GlTile]] = {}
+        for tile in tiles:
+            alike.setdefault(tuple(level.side for level in tile.levels), []).append(tile)
+        for sides, group in alike.items():
+            loads = [_load([tile.levels[i] for tile in group]) for i in range(len(sides))]
+            side, block = blocks.choose(loads, blocks.scale_of(view), self.shape)
+            for tile in group:
+                yield tile, tile.levels[sides.index(side)], block
+
+    def _cut(self, view: View, start: int, stop: int, side: float, block: int) -> _Runs:
+        columns = blocks.runs(view.origin[0], view.scale[0], 0, view.size[1], side, block)
+        lines = blocks.runs(view.origin[1], view.scale[1], start, stop, side, block)
+        data = np.concatenate([columns, lines])
+        buffer = self._buffers.get((side, block))
         if buffer is None or buffer.size < data.nbytes:
             if buffer is not None:
                 buffer.release()
-            buffer = self._runs[key] = self.ctx.buffer(reserve=2 * max(data.nbytes, RUN.itemsize))
+            buffer = self.ctx.buffer(reserve=2 * max(data.nbytes, RUN.itemsize))
+            self._buffers[side, block] = buffer
         buffer.orphan()
         buffer.write(data)
+        return _Runs(buffer, columns["cell"], lines["cell"])
 
     def _draw_tile(
-        self,
-        tile: GlTile,
-        level: GlLevel,
-        shape: Shape,
-        view: View,
-        target: moderngl.Texture,
-        columns: np.ndarray,  # the cell of every run, ascending
-        bands: np.ndarray,
+        self, variant: _Variant, tile: GlTile, level: GlLevel, view: View, runs: _Runs
     ) -> None:
-        x0, x1 = np.searchsorted(columns, (level.first[0], level.first[0] + level.shape[1]))
-        y0, y1 = np.searchsorted(bands, (level.first[1], level.first[1] + level.shape[0]))
+        x0, x1 = np.searchsorted(runs.columns, (level.first[0], level.first[0] + level.shape[1]))
+        y0, y1 = np.searchsorted(runs.lines, (level.first[1], level.first[1] + level.shape[0]))
         if x0 == x1 or y0 == y1:
             return
-        program = self._program(shape, TARGETS[target.dtype])
-        program["window"] = int(x0), int(x1), len(columns) + int(y0)
+        program = self._program(variant)
+        before = len(runs.columns)
+        program["window"] = int(x0), int(x1), before + int(y0), before + int(y1)
         program["grid_first"] = level.first
         program["grid_corner"] = tuple(
             first * level.side - origin
@@ -245,118 +283,35 @@ class GlRasterizer:
         program["grid_columns"] = level.shape[1]
         program["cell_side"] = level.side
         program["pixel_size"] = 1.0 / view.scale[0], 1.0 / view.scale[1]
-        buffers = (tile.records, level.offsets, level.entries, self._runs[level.side, shape])
+        if tile.unpacking is not None:
+            program["unpacking"] = tile.unpacking
+        buffers = (tile.records, level.lists, level.entries, runs.buffer)
         for binding, buffer in enumerate(buffers):
             buffer.bind_to_storage_buffer(binding)
-        program.run(-(-int(x1 - x0) // shape.runs), int(y1 - y0))
+        across, down = self.shape.threads
+        program.run(-(-int(x1 - x0) // across), -(-int(y1 - y0) // down))
         self.ctx.memory_barrier(moderngl.SHADER_IMAGE_ACCESS_BARRIER_BIT)
 
-    def _program(self, shape: Shape, target: str) -> moderngl.ComputeShader:
-        if (shape, target) not in self._programs:
+    def _program(self, variant: _Variant) -> moderngl.ComputeShader:
+        if variant not in self._programs:
+            flags = {"STEEP": variant.steep, "PACKED": variant.packed, "WIDE": variant.wide}
             defines = {
-                "ROWS": shape.rows,
-                "RUNS": shape.runs,
-                "PIXELS": shape.pixels,
-                "LINES": shape.lines,
-                "TARGET": target,
+                "BLOCK": variant.block,
+                "THREADS_X": self.shape.threads[0],
+                "THREADS_Y": self.shape.threads[1],
+                "TARGET": variant.target,
+                **{name: 1 for name, wanted in flags.items() if wanted},
             }
             source = load_shader(self.ctx, "rasterize.comp", defines)
-            self._programs[shape, target] = self.ctx.compute_shader(source)
-        return self._programs[shape, target]
+            self._programs[variant] = self.ctx.compute_shader(source)
+        return self._programs[variant]
 
 
-def choose(sides: Sequence[float], view: View, shapes: tuple[Shape, ...]) -> tuple[int, Shape]:
-    """The first shape that the cells of some level fill, and the index of the finest such level.
-
-    sides: of the cells of each level, source pixels, ascending. Where none fills any shape, the
-    coarsest level and the last shape.
-    """
-    scale = math.sqrt(view.scale[0] * view.scale[1])
-    for shape in shapes:
-        for index, side in enumerate(sides):
-            if side * scale >= shape.reach:
-                return index, shape
-    return len(sides) - 1, shapes[-1]
-
-
-def runs(
-    origin: float, scale: float, start: int, stop: int, side: float, longest: int
-) -> np.ndarray:
-    """The output pixels [start, stop) of one axis, cut where cells begin; (R,) of RUN.
-
-    In float64, from the cell's edge: a sample's position is exact at any zoom. A run has at most
-    `longest` pixels, and those of one cell are equally long to within one.
-    """
-    pixel = np.arange(start, stop)
-    centre = origin + (pixel + 0.5) / scale
-    cell = np.floor(centre / side)
-    edges = np.flatnonzero(np.diff(cell)) + 1
-    first = np.concatenate([[0], edges]).astype(np.int64)[: max(1, len(pixel))]
-    total = np.diff(np.concatenate([first, [len(pixel)]]))
-    pieces = -(-total // longest)
-    group = np.repeat(np.arange(len(first)), pieces)
-    part = np.arange(len(group)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    begin = first[group] + total[group] * part // pieces[group]
-    end = first[group] + total[group] * (part + 1) // pieces[group]
-    made = np.empty(len(group), RUN)
-    made["pixel"] = start + begin
-    made["count"] = end - begin
-    made["cell"] = np.clip(cell[begin], -(2**30), 2**30)
-    made["offset"] = centre[begin] - cell[begin] * side
-    return made
-
-
-def load_shader(ctx: moderngl.Context, name: str, defines: dict[str, object] | None = None) -> str:
-    """Source of shaders/`name` with `defines` after its version line; its includes are resolved."""
-    for path in shipped("shaders").glob("*.glsl"):
-        ctx.includes.setdefault(path.name, path.read_text())
-    version, rest = shipped(f"shaders/{name}").read_text().split("\n", 1)
-    lines = [version, *(f"#define {key} {value}" for key, value in (defines or {}).items()), rest]
-    return "\n".join(lines)
-
-
-def create_context() -> moderngl.Context:
-    """A headless context of OpenGL 4.3 or later, current on the calling thread.
-
-    Raises BackendError if there is none.
-    """
-    try:
-        return moderngl.create_context(require=430, standalone=True, backend="egl")
-    except Exception as failure:  # moderngl and glcontext raise bare Exception and ValueError
-        raise BackendError(
-            "No headless OpenGL 4.3 here; install a GPU driver or Mesa (libegl1 and "
-            "libgl1-mesa-dri), or use --backend cpu."
-        ) from failure
-
-
-@functools.cache
-def driver() -> dict:
-    """What a headless context says of itself, by OpenGL's names. Raises BackendError if none."""
-    # On a thread of its own, as a new context would displace the caller's.
-    with ThreadPoolExecutor(1, thread_name_prefix="gl-probe") as thread:
-        return thread.submit(_ask_driver).result()
-
-
-def _ask_driver() -> dict:
-    ctx = create_context()
-    try:
-        return dict(ctx.info)
-    finally:
-        ctx.release()
-
-
-def software(info: dict) -> bool:
-    """Whether a context with this `info` draws on the CPU."""
-    return any(name in info["GL_RENDERER"].lower() for name in SOFTWARE)
-
-
-@functools.cache
-def hardware() -> bool:
-    """Whether a headless OpenGL 4.3 device is here that is no software renderer. Never raises."""
-    try:
-        return not software(driver())
-    except BackendError:
-        return False
+def _load(levels: list[GlLevel]) -> Load:
+    """Of drawing these indexes, all of one size of cells."""
+    cells = max(1, sum(level.shape[0] * level.shape[1] for level in levels))
+    ordinary, steep = sum(level.ordinary for level in levels), sum(level.steep for level in levels)
+    return Load(levels[0].side, ordinary / cells, steep / cells)
 
 
 def render(gaussians: Gaussians, view: View, quality: str = "export") -> np.ndarray:
@@ -384,11 +339,10 @@ def _render(gaussians: Gaussians, view: View, quality: str) -> np.ndarray:
     image = np.zeros((*view.size, 3), np.float32)
     if image.size == 0 or len(gaussians) == 0:
         return image
-    sides = (rasterizer.side(view),)
     held: list[GlTile] = []
     try:
         for part in split_tiles(visible(gaussians, view, quality)):
-            held.append(rasterizer.upload(pack(part, quality, sides)))
+            held.append(rasterizer.upload(pack(part, quality)))
             if sum(tile.nbytes for tile in held) > HELD:
                 _add(rasterizer, held, view, image)
         _add(rasterizer, held, view, image)

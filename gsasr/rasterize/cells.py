@@ -71,11 +71,12 @@ def build(
         nothing = np.zeros(1, np.uint32), np.zeros(0, np.uint16)
         return [Cells(float(sides[0]), (0, 0), (0, 0), *nothing, 0, 0)]
     spans = _finest(mean, std, rho, cut, float(sides[0]))
-    levels = [_listed(spans, std, rho, cut)]
+    steep_from = _steep_from(std, rho, cut)
+    levels = [_listed(spans, steep_from)]
     for side in sides:
         if side > spans.side:
             spans = _merged(spans, round(side / spans.side))
-            levels.append(_listed(spans, std, rho, cut))
+            levels.append(_listed(spans, steep_from))
     return levels
 
 
@@ -94,9 +95,7 @@ class _Spans:
 
 def _finest(mean, std, rho, cut, side: float) -> _Spans:
     """Spans of the smallest cells, `side` or larger, whose lists stay short."""
-    drawn = cut >= 0
-    reach = np.sqrt(cut[drawn])[:, None] * std[drawn]
-    low, high = (mean[drawn] - reach).min(axis=0), (mean[drawn] + reach).max(axis=0)
+    low, high = _box(mean, std, cut)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise FieldError("The Gaussians hold values that are not finite; predict the field anew.")
     most = max(FEW, ENTRIES_PER_GAUSSIAN * len(cut))
@@ -126,11 +125,10 @@ def _merged(fine: _Spans, times: int) -> _Spans:
     return _Spans(fine.side * times, first, shape, row, begin, columns[:used].copy())
 
 
-def _listed(spans: _Spans, std, rho, cut) -> Cells:
-    """The lists of all cells."""
+def _listed(spans: _Spans, steep_from: np.ndarray) -> Cells:
+    """The lists of all cells; steep_from: the side of a cell from which each Gaussian is steep."""
     cells = spans.shape[0] * spans.shape[1]
-    steep = np.empty(len(cut), np.uint8)
-    _mark_steep(std, rho, cut, spans.side, steep)
+    steep = (spans.side > steep_from).astype(np.uint8)
     counts = np.zeros((cells, 2), np.int32)
     base, last = np.zeros(cells, np.uint32), np.zeros(cells, np.uint32)
     where = (spans.row, spans.begin, spans.columns, spans.shape[1], steep)
@@ -144,6 +142,22 @@ def _listed(spans: _Spans, std, rho, cut) -> Cells:
     return Cells(
         spans.side, spans.first, spans.shape, lists, entries, int(count + steeps), int(steeps)
     )
+
+
+@jit
+def _box(mean, std, cut):
+    """The corners of the rectangle round all ellipses."""
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for n in range(cut.shape[0]):
+        if cut[n] >= 0.0:
+            for axis in range(2):
+                reach = math.sqrt(cut[n]) * std[n, axis]
+                start, stop = mean[n, axis] - reach, mean[n, axis] + reach
+                if not start >= low[axis]:  # so that a value that is no number gets into the result
+                    low[axis] = start
+                if not stop <= high[axis]:
+                    high[axis] = stop
+    return low, high
 
 
 @jit
@@ -178,7 +192,7 @@ def _columns(mean, std, rho, cut, side, first, across, row, begin, columns):
         farthest = rho[n] * reach_y
         root = math.sqrt(1.0 - rho[n] * rho[n])
         # Lines between rows, from the ellipse's top to its bottom; t = y / (k sy)
-        upper, before, low, high = -reach_y, -1.0, -rho[n] * reach_x, -rho[n] * reach_x
+        upper, low, high = -reach_y, -rho[n] * reach_x, -rho[n] * reach_x
         for j in range(begin[n + 1] - begin[n]):
             lower = min(max((first[1] + row[n] + j + 1) * side - y, -reach_y), reach_y)
             t = lower / reach_y if reach_y > 0.0 else 1.0
@@ -222,12 +236,13 @@ def _merge(row, begin, columns, shift_x, shift_y, times, new_row, new_begin, new
 
 
 @jit
-def _mark_steep(std, rho, cut, side, steep):
-    """Where half a cell's diagonal is too many standard deviations for STEEP."""
+def _steep_from(std, rho, cut):
+    """The side of a cell of which half the diagonal is too many standard deviations for STEEP."""
+    side = np.empty(cut.shape[0])
     for n in range(cut.shape[0]):
-        root = math.sqrt(1.0 - rho[n] * rho[n])
-        least = narrow(std[n, 0], std[n, 1], root)
-        steep[n] = math.sqrt(max(0.0, cut[n])) + math.sqrt(0.5) * side / least > STEEP
+        least = narrow(std[n, 0], std[n, 1], math.sqrt(1.0 - rho[n] * rho[n]))
+        side[n] = (STEEP - math.sqrt(max(0.0, cut[n]))) * least * math.sqrt(2.0)
+    return side
 
 
 @jit

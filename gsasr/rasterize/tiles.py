@@ -5,13 +5,16 @@ NumPy and numba only, no OpenGL: this is the heavy part, and it can run on any t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from . import cells, records
 from .cells import Cells
+from .jit import jit
 from .records import Records
 
 if TYPE_CHECKING:
@@ -53,25 +56,31 @@ def split_tiles(gaussians: Gaussians, side: int = SIDE) -> list[Gaussians]:
     At most MOST to a tile, so that its buffers stay below what a driver takes. Within a tile they
     follow the pixels of the source row by row, so that the lists of a cell name near neighbours.
     """
+    import torch
+
     if len(gaussians) == 0:
         return []
     mean = _array(gaussians.mean)
-    pixel = np.clip(np.floor(mean) - np.floor(mean.min(axis=0)), 0, 2**31).astype(np.int64)
-    tile, inside = np.divmod(pixel, side)
-    number = tile[:, 1] * (tile[:, 0].max() + 1) + tile[:, 0]
-    if number.max() >= 2**16:  # far apart: count only tiles that hold something
-        number = np.unique(number, return_inverse=True)[1]
-    # Sorting 16 bits at a time is several times faster; the second sort keeps the first's order.
-    order = np.argsort((inside[:, 1] * side + inside[:, 0]).astype(np.uint16), kind="stable")
-    number = number[order]
-    small = number.astype(np.uint16) if number.max() < 2**16 else number
-    by_tile = np.argsort(small, kind="stable")
-    order, number = order[by_tile], number[by_tile]
-    parts = np.split(order, np.flatnonzero(np.diff(number)) + 1)
+    x0, y0, x1, y1 = (math.floor(edge) for edge in _extent(mean))
+    columns, rows = (x1 - x0) // side + 1, (y1 - y0) // side + 1
+    number = np.empty(len(mean), np.uint16 if columns * rows <= 2**16 else np.float64)
+    inside = np.empty(len(mean), np.uint16)
+    _places(mean, float(x0), float(y0), float(side), float(columns), number, inside)
+    # Sorting by 16 bits at a time is several times faster; the second sort keeps the first's order.
+    order = np.argsort(inside, kind="stable")
+    order = order[np.argsort(number[order], kind="stable")]
+    edges = [0, *(np.flatnonzero(np.diff(number[order])) + 1).tolist(), len(order)]
+    # One Gaussian's values lie side by side while they move, which is several times faster.
+    table = torch.cat([t.reshape(len(order), -1) for t in gaussians.tensors().values()], dim=1)
+    table = table.index_select(0, torch.from_numpy(order).to(table.device))
+    mean, std, rho, color, opacity = table.split([2, 2, 1, 3, 1], dim=1)
+    ordered = replace(
+        gaussians, mean=mean, std=std, rho=rho[:, 0], color=color, opacity=opacity[:, 0]
+    )
     return [
-        gaussians[part[start : start + MOST]]
-        for part in parts
-        for start in range(0, len(part), MOST)
+        ordered[start : min(start + MOST, stop)]
+        for begin, stop in pairwise(edges)
+        for start in range(begin, stop, MOST)
     ]
 
 
@@ -96,11 +105,10 @@ def pack(
     x, y = (first * finest.side for first in finest.first)
     bounds = (x, y, x + columns * finest.side, y + rows * finest.side)
     # Relative to the means, not to the footprints: one huge Gaussian must not cost the others bits.
-    around = np.concatenate([mean.min(axis=0), mean.max(axis=0)]) if len(mean) else np.zeros(4)
-    low = np.floor(around[:2])
-    made = records.make(mean - low, std, rho, _array(gaussians.peak), packed=quality == "screen")
-    origin = (int(low[0]), int(low[1]))
-    extent = tuple(around.tolist())
+    extent = _extent(mean)
+    origin = (math.floor(extent[0]), math.floor(extent[1]))
+    peak = _array(gaussians.peak)
+    made = records.make(mean - origin, std, rho, peak, packed=quality == "screen")
     return PackedTile(origin, made, tuple(levels), bounds, extent, float(std.max(initial=0.0)))
 
 
@@ -113,6 +121,24 @@ def visible(gaussians: Gaussians, view: View, quality: str) -> Gaussians:
     mean = _array(gaussians.mean)
     low, high = np.array(view.origin), np.array(view.to_source(view.size[1], view.size[0]))
     return gaussians[((mean + reach >= low) & (mean - reach <= high)).all(axis=1)]
+
+
+def _extent(mean: np.ndarray) -> tuple[float, float, float, float]:
+    """(x0, y0, x1, y1) round all means; zeros if there is none."""
+    if len(mean) == 0:
+        return 0.0, 0.0, 0.0, 0.0
+    x, y = mean[:, 0], mean[:, 1]  # several times faster than along an axis of two
+    return float(x.min()), float(y.min()), float(x.max()), float(y.max())
+
+
+@jit
+def _places(mean, x0, y0, side, columns, number, inside):
+    """The number of the tile that each mean is in, and of the pixel in it, row by row."""
+    for n in range(mean.shape[0]):
+        x, y = math.floor(mean[n, 0]) - x0, math.floor(mean[n, 1]) - y0
+        across, down = math.floor(x / side), math.floor(y / side)
+        number[n] = down * columns + across
+        inside[n] = int((y - down * side) * side + (x - across * side))
 
 
 def _array(tensor) -> np.ndarray:

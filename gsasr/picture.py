@@ -36,8 +36,9 @@ def render(
 
     Exactly one of: scale (floor(scale * side) pixels), size (height, width) of the whole
     picture, or view. backend: see rasterize.render. antialias: integrate over each pixel instead
-    of sampling at its centre, which aliases at small scales. progress: told the share done in (0, 1].
-    cancelled: asked now and then; Cancelled is raised if true. Raises RequestError, BackendError.
+    of sampling at its centre, which aliases at small scales. progress: told the share done in
+    (0, 1]. cancelled: asked now and then; Cancelled is raised if true. Raises RequestError,
+    BackendError.
     """
     if sum(choice is not None for choice in (scale, size, view)) != 1:
         raise RequestError("Give exactly one of scale, size and view.")

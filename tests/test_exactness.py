@@ -19,7 +19,7 @@ SIZE = (23, 32)  # of the views, pixels
 
 @pytest.fixture(scope="module")
 def field() -> Gaussians:
-    """A picture of several tiles: large Gaussians all over, and small ones round a corner of four."""
+    """A picture of several tiles: large Gaussians all over, small ones round a corner."""
     large = random_field(3000, (300, 310), largest_std=4.0)
     small = random_field(1500, (16, 16), seed=1)
     field = Gaussians.concatenate([large, small])
@@ -57,9 +57,21 @@ def test_the_sum_of_tiles_is_exact(field, zoom, backend, quality, antialias, req
     assert np.abs(at_once - expected).max() <= TOLERANCE[quality]
 
 
+@pytest.mark.parametrize("backend", ["cpu", "gl"])
+def test_a_sum_of_hundreds_of_thousands_at_each_pixel_is_exact(backend, request):
+    if backend == "gl":
+        request.getfixturevalue("gl_context")
+    field = random_field(1 << 19, (180, 180))  # 16 to a source pixel, as the paper's networks have
+    view = View.at_scale(field.size, 0.02)
+    drawn = render(field, view, backend, "export", antialias=True).numpy()
+    assert np.abs(drawn - oracle(field, view, antialias=True)).max() <= TOLERANCE["export"]
+
+
 @pytest.mark.parametrize("antialias", [False, True], ids=["sampled", "antialiased"])
 @pytest.mark.parametrize("zoom", ZOOMS)
-def test_what_the_window_draws_in_16_bits_is_exact_before_and_after_rounding_to_8(field, zoom, antialias, gl_context):
+def test_what_the_window_draws_in_16_bits_is_exact_before_and_after_rounding_to_8(
+    field, zoom, antialias, gl_context
+):
     view = view_at(zoom)
     expected = oracle(field, view, antialias).clip(0, 1)
     shown = integrated(field, view) if antialias else field

@@ -13,11 +13,13 @@ import torch
 from ..gaussians import Gaussians
 from ..view import View
 
-FOOTPRINT = 0.1  # variance of a pixel, in pixels of the output; why: docs/decisions.md
+# Variance of a pixel, in squared pixels of the output: about that of the Gaussian whose pictures
+# come nearest to the mean over a square pixel (tests/test_antialias.py).
+FOOTPRINT = 0.1
 
 
 def integrated(gaussians: Gaussians, view: View) -> Gaussians:
-    """The Gaussians whose value at a sample of `view` is the mean of `gaussians` over its pixel.
+    """The Gaussians that a sample of `view` must see to be the integral over its pixel.
 
     Means and colours stay; the covariance S grows by the footprint's to S', and the opacity
     falls by sqrt(|S| / |S'|), so that each Gaussian keeps its integral. Computed in float64,

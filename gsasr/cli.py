@@ -71,6 +71,7 @@ def upscale(options: argparse.Namespace) -> None:
             options.condition,
             options.backend,
             precision=options.precision,
+            antialias=options.antialias,
             progress=told,
             **given_tile(options),
         )
@@ -112,7 +113,13 @@ def render(options: argparse.Namespace) -> None:
     view = chosen_view(field.size, options.scale, options.size, options.region)
     image.check_output(options.output, view.size)
     with progress("rendering") as told:
-        color = render(field, view=view, backend=options.backend, progress=told)
+        color = render(
+            field,
+            view=view,
+            backend=options.backend,
+            antialias=options.antialias,
+            progress=told,
+        )
     image.write(options.output, color)
 
 
@@ -265,6 +272,13 @@ def parser() -> argparse.ArgumentParser:
             "--backend", choices=("auto", *BACKENDS), default="auto", help="rasterizer"
         )
 
+    def add_antialias(command: argparse.ArgumentParser) -> None:
+        command.add_argument(
+            "--antialias",
+            action="store_true",
+            help="integrate over each pixel instead of sampling at its centre; for scales below 1",
+        )
+
     def add_output(command: argparse.ArgumentParser, help: str) -> None:
         command.add_argument("-o", "--output", type=Path, required=True, help=help)
 
@@ -279,6 +293,7 @@ def parser() -> argparse.ArgumentParser:
     add_prediction(c)
     add_tile(c)
     add_backend(c)
+    add_antialias(c)
 
     c = command(predict, "turn a picture into Gaussians")
     c.add_argument("input", type=Path, help="picture")
@@ -295,6 +310,7 @@ def parser() -> argparse.ArgumentParser:
     c.add_argument("--size", type=size, metavar="WxH", help="output size in pixels")
     c.add_argument("--region", type=region, metavar="X,Y,W,H", help="part to draw, source pixels")
     add_backend(c)
+    add_antialias(c)
 
     c = command(info, "say what is in a picture, a file of Gaussians or a model")
     c.add_argument("input", type=Path, help="file")

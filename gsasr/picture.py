@@ -15,6 +15,7 @@ from .memory import require_picture
 from .model import GSASR
 from .predict import TILE, predict_tiles
 from .rasterize import footprint
+from .rasterize.antialias import integrated
 from .rasterize.tiles import split_tiles
 from .view import View
 
@@ -27,14 +28,17 @@ def render(
     size: tuple[int, int] | None = None,
     view: View | None = None,
     backend: str = "auto",
+    antialias: bool = False,
     progress: Callable[[float], None] = lambda share: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> np.ndarray:
     """(h, w, 3) float32 picture of a field, sRGB, not clamped, within 1e-4 of the exact sum.
 
     Exactly one of: scale (floor(scale * side) pixels), size (height, width) of the whole
-    picture, or view. backend: see rasterize.render. progress: told the share done in (0, 1].
-    cancelled: asked now and then; Cancelled is raised if true. Raises RequestError, BackendError.
+    picture, or view. backend: see rasterize.render. antialias: integrate over each pixel instead
+    of sampling at its centre, which aliases at small scales. progress: told the share done in
+    (0, 1]. cancelled: asked now and then; Cancelled is raised if true. Raises RequestError,
+    BackendError.
     """
     if sum(choice is not None for choice in (scale, size, view)) != 1:
         raise RequestError("Give exactly one of scale, size and view.")
@@ -47,7 +51,7 @@ def render(
     # The GPU draws all at once; elsewhere tile by tile, so that progress can be told.
     tiles = split_tiles(field) if backend == "cpu" else [field]
     parts = ((tile, number / len(tiles)) for number, tile in enumerate(tiles, start=1))
-    return _sum_of(parts, view, backend, progress, cancelled)
+    return _sum_of(parts, view, backend, antialias, progress, cancelled)
 
 
 def upscale(
@@ -58,6 +62,7 @@ def upscale(
     backend: str = "auto",
     tile: int = TILE,
     precision: str = "float32",
+    antialias: bool = False,
     progress: Callable[[float], None] = lambda share: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> np.ndarray:
@@ -66,18 +71,19 @@ def upscale(
     Each tile is predicted, drawn and dropped; since a picture is a sum of Gaussians, it is also
     the sum of its tiles. image: (H, W, 3) float32 in [0, 1]. condition: the scale told to the
     network; by default the view's, within what networks are trained for. tile, precision: see
-    predict. progress: told the share done in (0, 1].
+    predict. antialias: see render. progress: told the share done in (0, 1].
     """
     if condition is None:
         condition = conditioning_scale(max(view.scale))
     parts = predict_tiles(model, image, condition, tile, precision, cancelled=cancelled)
-    return _sum_of(parts, view, backend, progress, cancelled)
+    return _sum_of(parts, view, backend, antialias, progress, cancelled)
 
 
 def _sum_of(
     parts: Iterable[tuple[Gaussians, float]],
     view: View,
     backend: str,
+    antialias: bool,
     progress: Callable[[float], None],
     cancelled: Callable[[], bool],
 ) -> np.ndarray:
@@ -87,6 +93,8 @@ def _sum_of(
     for part, share in parts:
         if cancelled():
             raise Cancelled("Rendering was cancelled.")
+        if antialias:
+            part = integrated(part, view)
         rows, columns, window = _window(part, view)
         if window is not None:
             with torch.no_grad():

@@ -286,6 +286,33 @@ def export_the_view(ui: Ui, folder: Path) -> None:
     assert np.abs(written[::5, ::5] - expected).max() <= 0.5 / 255 + 1e-4
 
 
+def export_below_one_to_one(ui: Ui, folder: Path) -> None:
+    from gsasr import image
+    from gsasr.rasterize.antialias import integrated
+    from gsasr.view import View
+
+    field = open_field(ui, folder)
+    view = View.at_scale(field.size, 0.5)
+    smooth, sampled = oracle(integrated(field, view), view), oracle(field, view)
+    assert np.abs(smooth - sampled).max() > 3 / 255
+    for name, expected in (("smooth.png", smooth), ("sampled.png", sampled)):
+        ui.press("Ctrl+E")
+        ui.ctx.item_click("//###Export/Whole picture")
+        ui.ctx.item_input_value("//###Export/Scale", 0.5)
+        ui.ctx.item_input_value("//###Export/File", str(folder / name))
+        ui.ctx.yield_()
+        if name == "sampled.png":  # antialiased unless one chooses otherwise
+            ui.ctx.item_click("//###Export/Antialias")
+        ui.ctx.item_click("//###Export/Export")
+        ui.rest()
+        assert np.abs(image.read(folder / name).color - expected).max() <= 0.5 / 255 + 1e-4
+    # From 1:1 on there is no such choice.
+    ui.press("Ctrl+E")
+    ui.ctx.item_input_value("//###Export/Scale", 1.0)
+    ui.ctx.yield_()
+    assert not ui.ctx.item_exists("//###Export/Antialias")
+
+
 def export_errors_are_shown(ui: Ui, folder: Path) -> None:
     open_field(ui, folder)
     ui.press("Ctrl+E")
@@ -426,6 +453,7 @@ SCENARIOS = (
     overlays,
     export_the_whole,
     export_the_view,
+    export_below_one_to_one,
     export_errors_are_shown,
     open_another_by_drop,
     cancel_prediction,

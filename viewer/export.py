@@ -55,10 +55,12 @@ def export(
     document: Document,
     view: View,
     path: Path,
+    antialias: bool,
     upscale: Callable[[Task, View], np.ndarray],
 ) -> None:
     """Render the Gaussians through a view, exactly, and write them to a picture file.
 
+    antialias: integrate over each pixel (see gsasr.render).
     upscale: makes the (h, w, 3) picture where not all Gaussians are in memory.
 
     The source's alpha, gray, depth and colour profile are kept where the format holds them.
@@ -76,7 +78,12 @@ def export(
 
         field = Gaussians.concatenate(document.parts)
         color = render(
-            field, view=view, backend="cpu", progress=task.progress, cancelled=task.cancelled
+            field,
+            view=view,
+            backend="cpu",
+            antialias=antialias,
+            progress=task.progress,
+            cancelled=task.cancelled,
         )
     else:
         color = upscale(task, view)

@@ -26,6 +26,7 @@ class ExportDialog:
         self.whole = True
         self.by_scale = True
         self.scale = 4.0
+        self.antialias = True
         self.width = 0
         self.height = 0
         self._document = None
@@ -107,12 +108,18 @@ class ExportDialog:
             imgui.text(f"{width} × {height} pixels, {width * height / 1e6:.1f} megapixels")
         except GsasrError as error:
             imgui.text_colored(ERROR, str(error))
+        # Below 1:1 the window shows the source filtered, and so should the file by default.
+        minified = view is not None and min(view.scale) < 1
+        if minified:
+            _, self.antialias = imgui.checkbox("Antialias", self.antialias)
+            imgui.set_item_tooltip("Integrate over each pixel instead of sampling at its centre.")
         if session.worker.tasks:
             imgui.text_disabled("It begins when what is running has ended.")
         imgui.spacing()
         imgui.begin_disabled(view is None or not self._path.text.strip())
         if imgui.button("Export"):
-            session.export(view, Path(self._path.text.strip()).expanduser())
+            path = Path(self._path.text.strip()).expanduser()
+            session.export(view, path, antialias=minified and self.antialias)
             session.state.dialogs.discard(self.name)
         imgui.end_disabled()
         imgui.same_line()

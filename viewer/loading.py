@@ -115,7 +115,13 @@ class Loader:
                 return
 
     def upscale(
-        self, task: Task, document: Document, model_name: str, condition: float, view: View
+        self,
+        task: Task,
+        document: Document,
+        model_name: str,
+        condition: float,
+        view: View,
+        antialias: bool,
     ) -> np.ndarray:
         """(h, w, 3) float32: a picture through a view, without holding its Gaussians."""
         model = self._load(model_name)
@@ -128,6 +134,7 @@ class Loader:
             view,
             condition,
             backend="cpu",
+            antialias=antialias,
             progress=task.progress,
             cancelled=task.cancelled,
         )

@@ -113,16 +113,16 @@ class Session:
         if self.ready:
             self.worker.post(f"Saving {path.name}", work)
 
-    def export(self, view: View, path: Path) -> None:
-        """Write the Gaussians through a view to a picture file."""
+    def export(self, view: View, path: Path, antialias: bool) -> None:
+        """Write the Gaussians through a view to a picture file; antialias: see gsasr.render."""
         document = self.state.document
         model, condition = self.state.model, self.state.condition
 
         def upscale(task: Task, view: View) -> np.ndarray:
-            return self._loader.upscale(task, document, model, condition, view)
+            return self._loader.upscale(task, document, model, condition, view, antialias)
 
         def work(task: Task) -> None:
-            export.export(task, document, view, path, upscale)
+            export.export(task, document, view, path, antialias, upscale)
             size = f"{view.size[1]}×{view.size[0]}"
             self.worker.show(task, lambda: self.note(f"Exported {size} pixels to {path}"))
 

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
 import torch
 
 from ..errors import BackendError, RequestError
 from ..gaussians import Gaussians
 from ..view import View
 from . import BACKENDS
+from .antialias import integrated
 
 DIFFERENTIABLE = ("cpu", "cuda")  # also the names of their devices
 QUALITIES = ("screen", "export", "gradient")
+BLOCK = 64  # side of the blocks that OpenGL draws a minified field in, source pixels
+LONGEST = 1 << 15  # Gaussians in such a block: llvmpipe ends a shader after 65535 rounds of a loop
 
 
 def render(
-    gaussians: Gaussians, view: View, backend: str = "auto", quality: str | None = None
+    gaussians: Gaussians,
+    view: View,
+    backend: str = "auto",
+    quality: str | None = None,
+    antialias: bool = False,
 ) -> torch.Tensor:
     """(h, w, 3) float32 image of the Gaussians through the view, not clamped.
 
@@ -24,21 +35,22 @@ def render(
         that can run.
     quality: "screen" (error below half an 8-bit step), "export" (below 1e-4) or "gradient"
         (for training); by default "gradient" if a tensor requires it, else "export".
+    antialias: integrate over each pixel (see antialias.py) instead of sampling at its centre.
 
     The image of "cuda" stays on the card. Raises BackendError where the backend cannot run,
     RequestError for an unknown name.
     """
     backend, quality = _chosen(gaussians, backend, quality)
+    if antialias:
+        gaussians = integrated(gaussians, view)
     if backend == "reference":
         from . import reference
 
         return reference.render(gaussians, view).float()
     if backend == "gl":
-        from . import gl
-
         if _differentiable(gaussians):
             raise RequestError("The gl backend has no gradients; use backend='cpu' or 'cuda'.")
-        return torch.from_numpy(gl.render(_moved(gaussians, "cpu"), view, quality))
+        return _by_gl(_moved(gaussians, "cpu"), view, quality)
     from . import operator
 
     return operator.draw(_moved(gaussians, backend), [len(gaussians)], [view], quality)[0]
@@ -65,6 +77,43 @@ def render_batch(
     from . import operator
 
     return operator.draw(_moved(gaussians, backend), counts, views, quality)
+
+
+def _by_gl(gaussians: Gaussians, view: View, quality: str) -> torch.Tensor:
+    """By OpenGL; a minified view in a unit of about its pixels, and block by block.
+
+    The shader reads lists by cells of a few units. Of source pixels there would be many to a
+    pixel of the output, and all pixels near a block read nearly all of its Gaussians.
+    """
+    from . import gl
+
+    unit = 2.0 ** -round(math.log2(min(view.scale)))  # source pixels; so the change is exact
+    if unit <= 1:
+        return torch.from_numpy(gl.render(gaussians, view, quality))
+    height, width = gaussians.size
+    coarse = replace(
+        gaussians,
+        mean=gaussians.mean / unit,
+        std=gaussians.std / unit,
+        size=(math.ceil(height / unit), math.ceil(width / unit)),
+    )
+    x, y = (side / unit for side in view.origin)
+    coarse_view = View((x, y), (view.scale[0] * unit, view.scale[1] * unit), view.size)
+    image = torch.zeros(*view.size, 3)
+    for block in _blocks(coarse, BLOCK / unit, 1 / unit):
+        image += torch.from_numpy(gl.render(block, coarse_view, quality))
+    return image
+
+
+def _blocks(gaussians: Gaussians, side: float, least: float) -> Iterator[Gaussians]:
+    """The Gaussians by blocks of `side`, or down to `least` where there would be too many."""
+    from .tiles import split_tiles
+
+    for block in split_tiles(gaussians, side):
+        if len(block) <= LONGEST or side <= least:
+            yield block
+        else:
+            yield from _blocks(block, side / 2, least)
 
 
 def _differentiable(gaussians: Gaussians) -> bool:

@@ -1,0 +1,96 @@
+"""What the OpenGL benchmark compares: each rasterizer draws the picture, and counts its work."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fields import one, random_field
+
+from gsasr.rasterize import reference
+from gsasr.view import View
+
+sys.path.append(str(Path(__file__).parent.parent / "benchmarks"))
+
+from contestants import CONTESTANTS
+from contestants.cell_loop import CellLoop, banded
+from contestants.contestant import drawn
+from contestants.paper import Paper, box, sample
+
+EXACT = [name for name in CONTESTANTS if name not in ("paper", "quads, 16 bit")]
+VIEWS = {
+    "whole": View.at_scale((17, 23), 3),
+    "part": View((5.25, -2.5), (7.5, 7.5), (60, 90)),
+    "small": View((-3.0, -2.0), (0.7, 0.7), (19, 31)),
+    "deep": View((11.21, 8.83), (300.0, 300.0), (33, 44)),
+}
+
+
+@pytest.fixture(scope="module")
+def field():
+    return random_field(1200, (17, 23), largest_std=1.2)
+
+
+@pytest.mark.parametrize("view", VIEWS.values(), ids=VIEWS.keys())
+@pytest.mark.parametrize("name", EXACT)
+def test_a_contestant_draws_what_the_reference_draws(gl_context, monkeypatch, field, name, view):
+    monkeypatch.setattr(CONTESTANTS[name], "dtype", "f4", raising=False)
+    assert_draws(gl_context, name, field, view, 1e-3)
+
+
+def test_quads_of_16_bits_lose_some_8_bit_steps_where_hundreds_add_up(gl_context, field):
+    assert_draws(gl_context, "quads, 16 bit", field, VIEWS["whole"], 8 / 255)
+
+
+def test_bands_of_small_buffers_draw_the_same(gl_context, monkeypatch, field):
+    records, cut = drawn(field)
+    bands = banded(records, cut, 8192)
+    assert len(bands) > 3
+    assert sum(len(band[0]) for band in bands) == len(records)
+    assert all(array.nbytes <= 8192 for band in bands for array in (band[0], band[4]))
+    monkeypatch.setattr(CellLoop, "dtype", "f4")
+    monkeypatch.setattr("contestants.cell_loop.banded", lambda *_: bands)
+    assert_draws(gl_context, "cell loop", field, VIEWS["part"], 1e-3)
+
+
+def test_the_paper_draws_within_its_box(gl_context, field):
+    view = VIEWS["part"]
+    truth = reference.render(field, view, box(field, view)).numpy()
+    contestant = Paper(gl_context, field)
+    contestant.draw(view)
+    assert contestant.share(view) == 1
+    # A pixel at the very edge of a box may fall on either side of it.
+    wrong = np.abs(contestant.image() - truth).max(axis=2) > 1e-4
+    assert wrong.mean() < 2e-3
+
+
+def test_the_paper_draws_a_share_where_all_would_take_too_long(field):
+    some = sample(field, VIEWS["whole"], 100 * VIEWS["whole"].size[0] * VIEWS["whole"].size[1])
+    assert len(some) == 100
+    assert bool((some.mean[0] == field.mean[0]).all() and (some.mean[-1] == field.mean[-1]).all())
+
+
+def test_a_contestant_counts_the_pixels_of_one_gaussian(gl_context):
+    # It covers an area of 1.57, so its cut is q = 2 ln(1.57 / 5e-4) = 16.1: a circle of 4.01
+    # standard deviations, 20.06 pixels, round the middle of 90x90.
+    field = one((4.5, 4.5), (0.5, 0.5), size=(9, 9))
+    view = View.at_scale(field.size, 10)
+    counted = {
+        name: make(gl_context, field).evaluations(view) for name, make in CONTESTANTS.items()
+    }
+    assert counted["quads"] == counted["quads, 16 bit"] == 40**2
+    assert counted["cpu"] == pytest.approx(np.pi * 20.06**2, rel=0.02)
+    # Of the 5x5 cells round the mean all but the corners, 2.12 source pixels away, are met.
+    assert counted["cell loop"] == 21 * 100
+    assert counted["cell loop"] <= counted["gsasr"] <= 81 * 100
+    assert counted["paper"] == 8**2  # |offset| <= 0.1 * 89 / 2 = 4.45 pixels
+
+
+def assert_draws(ctx, name, field, view, tolerance):
+    contestant = CONTESTANTS[name](ctx, field)
+    contestant.draw(view)
+    truth = reference.render(field, view)
+    error = torch.from_numpy(contestant.image().copy()).double() - truth
+    contestant.release()
+    assert float(error.abs().max()) < tolerance

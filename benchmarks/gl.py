@@ -131,6 +131,9 @@ def contestants(
     ctx: moderngl.Context, drawn: Gaussians, names: list[str]
 ) -> Iterator[list[Contestant]]:
     made = [CONTESTANTS[name](ctx, drawn) for name in names]
+    for each in made:
+        each.draw(View((0.0, 0.0), (1.0, 1.0), (8, 8)))  # compiles what the first frame needs
+    ctx.finish()
     yield made
     for each in made:
         each.release()

@@ -1,5 +1,6 @@
 """What the OpenGL benchmark compares: each rasterizer draws the picture, and counts its work."""
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -8,16 +9,14 @@ import pytest
 import torch
 from fields import one, random_field
 
+from benchmarks.contestants import CONTESTANTS
+from benchmarks.contestants.cell_loop import CellLoop, banded
+from benchmarks.contestants.contestant import drawn
+from benchmarks.contestants.paper import Paper, box, sample
 from gsasr.rasterize import reference
 from gsasr.view import View
 
-sys.path.append(str(Path(__file__).parent.parent / "benchmarks"))
-
-from contestants import CONTESTANTS
-from contestants.cell_loop import CellLoop, banded
-from contestants.contestant import drawn
-from contestants.paper import Paper, box, sample
-
+BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
 EXACT = [name for name in CONTESTANTS if name not in ("paper", "quads, 16 bit")]
 VIEWS = {
     "whole": View.at_scale((17, 23), 3),
@@ -50,7 +49,7 @@ def test_bands_of_small_buffers_draw_the_same(gl_context, monkeypatch, field):
     assert sum(len(band[0]) for band in bands) == len(records)
     assert all(array.nbytes <= 8192 for band in bands for array in (band[0], band[4]))
     monkeypatch.setattr(CellLoop, "dtype", "f4")
-    monkeypatch.setattr("contestants.cell_loop.banded", lambda *_: bands)
+    monkeypatch.setattr("benchmarks.contestants.cell_loop.banded", lambda *_: bands)
     assert_draws(gl_context, "cell loop", field, VIEWS["part"], 1e-3)
 
 
@@ -85,6 +84,38 @@ def test_a_contestant_counts_the_pixels_of_one_gaussian(gl_context):
     assert counted["cell loop"] == 21 * 100
     assert counted["cell loop"] <= counted["gsasr"] <= 81 * 100
     assert counted["paper"] == 8**2  # |offset| <= 0.1 * 89 / 2 = 4.45 pixels
+
+
+def test_the_benchmark_prints_a_row_for_every_contestant_and_view(gl_context, tmp_path):
+    small = "--sources 16 --per-pixel 2 --sizes 64x48 --zooms fit 40 --frames 2"
+    short = "--path-seconds 0.4 --path-fps 10 --path-stride 2"
+    out = tmp_path / "gl.md"
+    printed = run(f"gl.py {small} {short} --out {out}")
+    assert out.read_text() == printed
+    for name in ("gsasr", "cell loop", "quads", "cpu", "paper"):
+        rows = [line for line in printed.splitlines() if f"| {name} " in line]
+        assert len(rows) == 4, name  # the bytes, two views, the path
+        assert all(float(row.split(" | ")[4]) > 0 for row in rows[1:3])
+
+
+def test_the_breakdown_of_a_frame_adds_up(gl_context):
+    printed = run("breakdown.py --side 16 --size 64x48 --zooms 4 --frames 1")
+    lines = printed.split("```")[1].strip().splitlines()
+    depths = [(len(line) - len(line.lstrip())) // 2 for line in lines]
+    seconds = [float(line[36:44]) for line in lines]
+    assert "dispatches" in printed and "display pass" in printed
+    parts = sum(s for s, depth in zip(seconds, depths, strict=True) if depth == 1)
+    assert depths[0] == 0 and parts == pytest.approx(seconds[0], abs=0.01 * len(lines))
+
+
+def run(command):
+    """What a benchmark prints."""
+    script, *arguments = command.split()
+    done = subprocess.run(
+        [sys.executable, BENCHMARKS / script, *arguments], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
 def assert_draws(ctx, name, field, view, tolerance):

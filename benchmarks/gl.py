@@ -14,8 +14,8 @@ time: of the GPU, by timer queries; on software OpenGL and of what runs without 
 evaluations: pairs of a pixel and a Gaussian that the frame looks at. For lists, every pixel times
     the length of the list that it reads; for boxes and ellipses, the pixels within. They are
     counted on the CPU, from the index, for the view; the rate divides by the median time.
-paper: where its work is too long it draws a sample of the Gaussians, and the time is scaled up
-    by the share in brackets.
+paper: where its work is too long it draws a sample of the Gaussians, as large a part of them as
+    the brackets say, and the time is scaled up.
 """
 
 from __future__ import annotations
@@ -80,10 +80,10 @@ def options() -> argparse.ArgumentParser:
         choices=[name for name in CONTESTANTS if name != Ours.name], metavar="RASTERIZER",
         help=", ".join(name for name in CONTESTANTS if name != Ours.name))  # fmt: skip
     add("--frames", type=int, default=9, help="at most, of a fixed view")
-    add("--seconds", type=float, default=1.0, help="after which a rasterizer leaves a fixed view")
-    add("--path-seconds", type=float, default=6.0)
-    add("--path-fps", type=float, default=10.0)
-    add("--path-stride", type=int, default=6, help="the others draw every n-th view of the path")
+    add("--seconds", type=float, default=0.5, help="after which a rasterizer leaves a fixed view")
+    add("--path-seconds", type=float, default=4.0)
+    add("--path-fps", type=float, default=8.0)
+    add("--path-stride", type=int, default=8, help="the others draw every n-th view of the path")
     add("--no-path", action="store_true")
     add("--out", type=Path, help="also write to this file")
     return parser
@@ -169,8 +169,14 @@ class Timing:
     evaluations: list[int] = field(default_factory=list)
     share: float = 1.0
 
+    @property
+    def sample(self) -> str:
+        """What was drawn, if not all."""
+        return f" (1/{1 / self.share:.0f})" if self.share < 1 else ""
+
     def milliseconds(self, percentile: float) -> str:
-        return f"{1e3 * np.percentile(self.seconds, percentile):.3g}"
+        time = 1e3 * np.percentile(self.seconds, percentile)
+        return f"{time:.3g}" if time < 100 else f"{time:,.0f}"
 
     def rate(self) -> str:
         """10^9 evaluations per second."""
@@ -192,13 +198,12 @@ def fixed_views(
             timings = compare(ctx, made, view, arguments.frames, arguments.seconds)
             ours = made[0].image()
             for each, timing in zip(made, timings, strict=True):
-                part = f" ({timing.share:.1%})" if timing.share < 1 else ""
                 # Only whole pictures can be compared, and the paper's boxes cut what others draw.
                 same = each.name != "paper" and each is not made[0]
                 report.row(
                     f"{canvas[1]}x{canvas[0]}",
                     f"{view.scale[0]:.4g}",
-                    each.name + part,
+                    each.name + timing.sample,
                     len(timing.seconds),
                     timing.milliseconds(50),
                     timing.milliseconds(99),
@@ -279,10 +284,9 @@ def path(
                     if all_draw:
                         both.append(seconds)
         for each, timing, both in zip(made, timings, shared, strict=True):
-            part = f" ({timing.share:.1%})" if timing.share < 1 else ""
             report.row(
                 f"{canvas[1]}x{canvas[0]}",
-                each.name + part,
+                each.name + timing.sample,
                 len(timing.seconds),
                 timing.milliseconds(50),
                 timing.milliseconds(99),

@@ -6,11 +6,11 @@ import math
 import time
 
 import moderngl
+import numba
 import numpy as np
 
 from gsasr.gaussians import Gaussians
 from gsasr.rasterize import gl
-from gsasr.rasterize.jit import jit
 from gsasr.view import View
 
 from .contestant import FOLD, GlContestant, drawn, shader, visits, whole_and_rest
@@ -116,7 +116,7 @@ def _ellipses(records: np.ndarray, cut: np.ndarray) -> tuple[np.ndarray, ...]:
     return mean, reach, -b / np.hypot(b, c)
 
 
-@jit
+@numba.njit
 def _columns(mean, reach, rho, n, y):
     """First and last cell of a row of cells, from y to y + 1, that ellipse n meets."""
     # The ellipse is x = mean + reach (rho t + root e), y = mean + reach t with t^2 + e^2 <= 1.
@@ -133,7 +133,7 @@ def _columns(mean, reach, rho, n, y):
     return int(np.floor(x0)), int(np.floor(x1))
 
 
-@jit
+@numba.njit
 def _counts(mean, reach, rho):
     counts = np.zeros(len(rho), np.int64)
     for n in range(len(rho)):
@@ -144,7 +144,7 @@ def _counts(mean, reach, rho):
     return counts
 
 
-@jit
+@numba.njit
 def _lists(mean, reach, rho, first, rows, columns, total):
     offsets = np.zeros(rows * columns + 1, np.uint32)
     entries = np.empty(total, np.uint32)

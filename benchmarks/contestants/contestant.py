@@ -92,9 +92,11 @@ def drawn(field: Gaussians) -> tuple[np.ndarray, np.ndarray]:
     """What a plain rasterizer needs of each Gaussian that shows: records and cuts, in rows.
 
     (N, 8) float32: mean x, y, source pixels; the whitening a, b, c of shaders/gaussian.glsl; the
-    peak red, green, blue. (N,) float64: draw where q <= cut, as ours does for the screen.
+    peak red, green, blue. (N,) float64: draw where q <= cut, the same that ours draws.
     """
-    cut = footprint.cut(field, "screen").numpy()
+    parts = gl.split_tiles(field)  # ours cuts by what is in a tile
+    cut = np.concatenate([footprint.cut(part, "screen").numpy() for part in parts])
+    field = Gaussians.concatenate(parts)
     order = np.argsort(field.mean[:, 1].numpy(), kind="stable")
     order = order[cut[order] >= 0]
     std, rho = (t.numpy()[order].astype(np.float64) for t in (field.std, field.rho))

@@ -38,8 +38,8 @@ class Ours(GlContestant):
             packed = packed_field(field, threads)
             self.seconds[threads] = time.perf_counter() - start
         self._levels = [[_lists(level) for level in tile.levels] for tile in packed]
-        self.gaussians = sum(tile.records.nbytes for tile in packed)
         self.tiles = [self.rasterizer.upload(tile) for tile in packed]
+        self.gaussians = sum(tile.records.size for tile in self.tiles)
         self.index = sum(tile.nbytes for tile in self.tiles) - self.gaussians
 
     def draw(self, view: View) -> None:

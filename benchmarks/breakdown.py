@@ -26,7 +26,7 @@ from gl import middle, size
 from measure import machine
 
 from gsasr.processor import cores
-from gsasr.rasterize import gl
+from gsasr.rasterize import blocks, gl
 from gsasr.rasterize.tiles import PackedTile
 from gsasr.view import View
 from viewer.scene import Overlay, Scene, Target
@@ -36,7 +36,7 @@ WIDTH = 40  # of a bar that is the whole frame, characters
 # What is timed: class or module, its function, the name shown, whether the GPU works at it.
 HOOKS = (
     (gl.GlRasterizer, "draw", "Gaussians", False),
-    (gl, "runs", "runs of pixels, NumPy", False),
+    (blocks, "runs", "runs of pixels, NumPy", False),
     (moderngl.Context, "framebuffer", "framebuffers", False),
     (moderngl.Framebuffer, "clear", "clear", True),
     (moderngl.Buffer, "orphan", "uploads", False),

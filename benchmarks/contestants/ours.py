@@ -37,8 +37,11 @@ class Ours(GlContestant):
             start = time.perf_counter()
             packed = packed_field(field, threads)
             self.seconds[threads] = time.perf_counter() - start
-        self._levels = [[_lists(level) for level in tile.levels] for tile in packed]
         self.tiles = [self.rasterizer.upload(tile) for tile in packed]
+        self._levels = {
+            id(tile): {level.side: _lists(level) for level in source.levels}
+            for tile, source in zip(self.tiles, packed, strict=True)
+        }
         self.gaussians = sum(tile.records.size for tile in self.tiles)
         self.index = sum(tile.nbytes for tile in self.tiles) - self.gaussians
 
@@ -47,18 +50,16 @@ class Ours(GlContestant):
 
     def evaluations(self, view: View) -> int:
         """Not counted: slots of a thread's block of pixels that lie beyond its cell."""
+        seen = [tile for tile in self.tiles if tile.meets(view)]
         total = 0
-        for tile, levels in zip(self.tiles, self._levels, strict=True):
-            if tile.meets(view):
-                sides = [side for side, _, _ in levels]
-                index, _ = gl.choose(sides, view, self.rasterizer._shapes)
-                side, first, lengths = levels[index]
-                total += visits(lengths, first, side, view)
+        for tile, level, _ in self.rasterizer._plan(seen, view):
+            side, first, lengths = self._levels[id(tile)][level.side]
+            total += visits(lengths, first, side, view)
         return total
 
     def mean_list(self) -> float:
         """Entries of the finest index per cell that has any."""
-        lengths = [levels[0][2] for levels in self._levels]
+        lengths = [levels[min(levels)][2] for levels in self._levels.values()]
         return sum(map(np.sum, lengths)) / max(1, sum(map(np.count_nonzero, lengths)))
 
     def release(self) -> None:
@@ -78,19 +79,21 @@ def packed_field(field: Gaussians, threads: int) -> list[PackedTile]:
 def with_empty_lists(tile: PackedTile) -> PackedTile:
     """The same grid of cells with nothing in them: a frame without the Gaussians."""
     return replace(
-        tile, levels=tuple(replace(c, offsets=np.zeros_like(c.offsets)) for c in tile.levels)
+        tile, levels=tuple(replace(c, lists=np.zeros_like(c.lists)) for c in tile.levels)
     )
 
 
 def with_one_gaussian(tile: PackedTile) -> PackedTile:
     """Lists as long as before, but of the first Gaussian only: a frame that waits for no memory."""
-    return replace(
-        tile, levels=tuple(replace(c, entries=np.zeros_like(c.entries)) for c in tile.levels)
-    )
+    levels = []
+    for cells in tile.levels:
+        lists = cells.lists.copy()
+        lists[2::3] = 0  # the bases
+        levels.append(replace(cells, lists=lists, entries=np.ones_like(cells.entries)))
+    return replace(tile, levels=tuple(levels))
 
 
 def _lists(level) -> tuple[float, tuple[int, int], np.ndarray]:
     """Side of the cells, the first one and the lengths of their lists (rows, columns)."""
-    # A cell has two lists, smooth and steep, and a pixel reads both.
-    lengths = np.diff(level.offsets.astype(np.int64)).reshape(*level.shape, 2).sum(axis=2)
-    return level.side, level.first, lengths
+    pairs = np.diff(level.lists[::3].astype(np.int64))  # of ordinary and steep entries
+    return level.side, level.first, 2 * pairs.reshape(level.shape)

@@ -20,21 +20,17 @@ from __future__ import annotations
 
 import argparse
 import math
-from ctypes import c_float, c_int
-from pathlib import Path
 
-import numba
-import numpy as np
 import torch
+from contestants import paper
 from fields import plane
 from measure import machine, median_seconds, peak_memory
 
 from gsasr.gaussians import Gaussians
-from gsasr.rasterize import cuda, footprint, nvrtc, render
+from gsasr.rasterize import cuda, footprint, render
 from gsasr.rasterize.batch import pictures, views_tensor
 from gsasr.view import View
 
-R = 0.1  # the paper's rasterization ratio
 OPERATIONS = 12  # float32 operations of one evaluation
 EXPONENTIALS = 16  # per clock and multiprocessor, of every architecture since Turing
 
@@ -156,59 +152,18 @@ def gather_time(tensors: list[torch.Tensor], batch: list) -> tuple[int, float]:
 
 def paper_on_card(field: Gaussians, view: View, most: float) -> tuple[float, float, float]:
     """Algorithm 1 on the card: ms of forward and both, share of the Gaussians that were drawn."""
-    device = torch.device("cuda", torch.cuda.current_device())
-    major, minor = torch.cuda.get_device_capability(device)
-    binary = nvrtc.compiled(10 * major + minor, Path(__file__).with_name("paper.cu"))
-    launch = cuda.module(binary, device)
-    height, width = view.size
-    count = max(1, min(len(field), int(100 * most / (height * width))))
-    # A sample from all over the picture, as many threads at a time as the card runs.
-    some = field[torch.linspace(0, len(field) - 1, count).long()]
-    tensors = [t.to(device).contiguous() for t in (some.mean, some.std, some.rho, some.peak)]
-    box = c_float(R * (width - 1) / 2), c_float(R * (height - 1) / 2)
-    shared = (*tensors, c_float(view.scale[0]), *box, c_int(width), c_int(height))
-    pixels = torch.zeros(height, width, 3, device=device)
-    grads = torch.zeros(count, 8, device=device)
-
-    def forward() -> None:
-        launch("paper_forward", count, count, *shared, pixels.zero_())
-
-    def both() -> None:
-        forward()
-        launch("paper_backward", count, count, *shared, pixels, grads)
-
-    share = count / len(field)
-    times = [1e3 * median_seconds(work, 1, "cuda") / share for work in (forward, both)]
+    some = paper.sample(field, view, paper.ON_CARD * most)
+    card = paper.OnCard(some, view)
+    share = len(some) / len(field)
+    times = [1e3 * median_seconds(work, 1, "cuda") / share for work in (card.forward, card.both)]
     return (*times, share)
 
 
 def paper_on_host(field: Gaussians, view: View, most: float) -> tuple[float, float, float]:
     """The same by numba on one core, forward only: (ms, 0, share)."""
-    height, width = view.size
-    count = max(1, min(len(field), int(most / (height * width))))
-    some = field[torch.linspace(0, len(field) - 1, count).long()]
-    arrays = [t.numpy() for t in (some.mean, some.std, some.rho, some.peak)]
-    pixels = np.zeros((height, width, 3), np.float32)
-    box = R * (width - 1) / 2, R * (height - 1) / 2
-    share = count / len(field)
-    seconds = median_seconds(lambda: _paper(*arrays, view.scale[0], *box, pixels), 1)
-    return 1e3 * seconds / share, 0.0, share
-
-
-@numba.njit(fastmath=True)
-def _paper(mean, std, rho, peak, scale, box_x, box_y, pixels):
-    for n in range(mean.shape[0]):
-        center_x, center_y = mean[n, 0] * scale - 0.5, mean[n, 1] * scale - 0.5
-        for y in range(pixels.shape[0]):
-            for x in range(pixels.shape[1]):
-                dx, dy = x - center_x, y - center_y
-                if abs(dx) > box_x or abs(dy) > box_y:
-                    continue
-                u, v = dx / (std[n, 0] * scale), dy / (std[n, 1] * scale)
-                q = (u * u - 2 * rho[n] * u * v + v * v) / (1 - rho[n] * rho[n])
-                weight = math.exp(-0.5 * q)
-                for channel in range(3):
-                    pixels[y, x, channel] += weight * peak[n, channel]
+    some = paper.sample(field, view, most)
+    share = len(some) / len(field)
+    return 1e3 * median_seconds(lambda: paper.on_host(some, view), 1) / share, 0.0, share
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from gsasr.errors import BackendError
 from gsasr.rasterize import nvrtc, reference
 from gsasr.view import View
 
-PAPER = Path(__file__).parent.parent / "benchmarks" / "paper.cu"
+PAPER = Path(__file__).parent.parent / "benchmarks" / "contestants" / "paper.cu"
 
 
 @pytest.fixture(scope="module")

@@ -94,7 +94,7 @@ class Camera:
             self._left = 0.0
             self.pose = self._target
         else:
-            self.pose = _between(self._target, self._start, self._left)
+            self.pose = between(self._target, self._start, self._left)
         return True
 
     def zoom(self, octaves: float, at: tuple[float, float] | None = None) -> None:
@@ -133,7 +133,7 @@ class Camera:
             # What is left of a zoom goes on, about the same canvas point.
             self._start = _moved(self._start, dx, dy)
             self._target = target
-            self.pose = _between(target, self._start, self._left) if self.moving else target
+            self.pose = between(target, self._start, self._left) if self.moving else target
             self._fitted = False
 
     def look_at(self, x: float, y: float, scale: float) -> None:
@@ -176,7 +176,7 @@ def _moved(pose: Pose, dx: float, dy: float) -> Pose:
     return Pose(pose.x - dx / pose.scale, pose.y - dy / pose.scale, pose.scale)
 
 
-def _between(end: Pose, start: Pose, left: float) -> Pose:
+def between(end: Pose, start: Pose, left: float) -> Pose:
     """The pose with share `left` of the way to go: log-scale linear, origin linear in 1/scale."""
     way = math.log(end.scale / start.scale)
     # (1/k - 1/k1) / (1/k0 - 1/k1), written so that it is exact for small and no zooms

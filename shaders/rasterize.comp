@@ -29,6 +29,7 @@ uniform vec2 grid_corner;   // where that cell begins, source pixels, relative t
 uniform int grid_columns;
 uniform float cell_side;    // source pixels
 uniform vec2 pixel_size;    // source pixels
+uniform uvec2 portion;      // of every list the pairs from [0] below [1]: drivers end long loops
 
 const int MIDDLE = BLOCK / 2;  // a run lies round this slot of a block
 
@@ -135,7 +136,8 @@ void main()
     uint start = lists[list], end = lists[list + 1];
 #endif
     uint base = lists[list + 2];
-    for (uint pair = start; pair < end; ++pair) {
+    end = min(end, start + portion[1]);
+    for (uint pair = start + portion[0]; pair < end; ++pair) {
 #ifdef WIDE
         uint first = entries[2u * pair], second = entries[2u * pair + 1u];
 #else

@@ -212,6 +212,30 @@ def test_entries_of_32_bits_draw_the_same_picture(rasterizer, monkeypatch):
     assert np.abs(draw(rasterizer, [tile], view) - expected).max() < 1e-4
 
 
+def test_lists_longer_than_a_driver_reads_in_one_go_are_drawn_whole(rasterizer, monkeypatch):
+    gaussians = random_gaussians()
+    view = View((0.3, 0.2), (9.0, 9.0), (150, 200))
+    expected = reference.render(gaussians, view).numpy()
+    monkeypatch.setattr(gl, "PORTION", 3)
+    tile = rasterizer.upload(gaussians, "export")
+    assert min(level.longest for level in tile.levels) > 3 * 3
+    assert np.abs(draw(rasterizer, [tile], view) - expected).max() < 1e-4
+
+
+def test_a_hundred_thousand_gaussians_on_one_pixel_are_all_drawn():
+    count = 150_000
+    crowd = Gaussians(
+        mean=torch.full((count, 2), 1.5),
+        std=torch.full((count, 2), 0.5),
+        rho=torch.zeros(count),
+        color=torch.ones(count, 3),
+        opacity=torch.full((count,), 1.0 / count),
+        size=(3, 3),
+    )
+    drawn = gl.render(crowd, View((0.0, 0.0), (5.0, 5.0), (15, 15)), "export")
+    assert drawn[7, 7] == pytest.approx([1.0] * 3, abs=1e-3)  # float32 adds up so many to this
+
+
 def test_records_are_short_for_the_screen_only_where_their_range_suffices(rasterizer):
     usual = random_gaussians()
     view = View.at_scale(usual.size, 5)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -16,8 +15,6 @@ from .antialias import integrated
 
 DIFFERENTIABLE = ("cpu", "cuda")  # also the names of their devices
 QUALITIES = ("screen", "export", "gradient")
-BLOCK = 64  # side of the blocks that OpenGL draws a minified field in, source pixels
-LONGEST = 1 << 15  # Gaussians in such a block: llvmpipe ends a shader after 65535 rounds of a loop
 
 
 def render(
@@ -80,11 +77,8 @@ def render_batch(
 
 
 def _by_gl(gaussians: Gaussians, view: View, quality: str) -> torch.Tensor:
-    """By OpenGL; a minified view in a unit of about its pixels, and block by block.
-
-    The shader reads lists by cells of a few units. Of source pixels there would be many to a
-    pixel of the output, and all pixels near a block read nearly all of its Gaussians.
-    """
+    """By OpenGL; a minified view in a unit of about its pixels, since cells are a few units large
+    and one that is much smaller than a pixel is read for nothing."""
     from . import gl
 
     unit = 2.0 ** -round(math.log2(min(view.scale)))  # source pixels; so the change is exact
@@ -99,21 +93,7 @@ def _by_gl(gaussians: Gaussians, view: View, quality: str) -> torch.Tensor:
     )
     x, y = (side / unit for side in view.origin)
     coarse_view = View((x, y), (view.scale[0] * unit, view.scale[1] * unit), view.size)
-    image = torch.zeros(*view.size, 3)
-    for block in _blocks(coarse, BLOCK / unit, 1 / unit):
-        image += torch.from_numpy(gl.render(block, coarse_view, quality))
-    return image
-
-
-def _blocks(gaussians: Gaussians, side: float, least: float) -> Iterator[Gaussians]:
-    """The Gaussians by blocks of `side`, or down to `least` where there would be too many."""
-    from .tiles import split_tiles
-
-    for block in split_tiles(gaussians, side):
-        if len(block) <= LONGEST or side <= least:
-            yield block
-        else:
-            yield from _blocks(block, side / 2, least)
+    return torch.from_numpy(gl.render(coarse, coarse_view, quality))
 
 
 def _differentiable(gaussians: Gaussians) -> bool:

@@ -37,6 +37,7 @@ class Cells:
     entries: pairs of uint16 (or uint32, where bases and these would not do): entry e > 0 of a
         cell is the Gaussian base + e - 1, ascending within a list; 0 is none, and fills a pair.
     count: entries that are not 0; steep: how many of those are in steep lists.
+    longest: pairs in the longest list.
     """
 
     side: float
@@ -46,6 +47,7 @@ class Cells:
     entries: np.ndarray
     count: int
     steep: int
+    longest: int
 
     @property
     def wide(self) -> bool:
@@ -69,7 +71,7 @@ def build(
     mean, std, rho, cut = (np.ascontiguousarray(a, np.float64) for a in (mean, std, rho, cut))
     if not (cut >= 0).any():
         nothing = np.zeros(1, np.uint32), np.zeros(0, np.uint16)
-        return [Cells(float(sides[0]), (0, 0), (0, 0), *nothing, 0, 0)]
+        return [Cells(float(sides[0]), (0, 0), (0, 0), *nothing, 0, 0, 0)]
     spans = _finest(mean, std, rho, cut, float(sides[0]))
     steep_from = _steep_from(std, rho, cut)
     levels = [_listed(spans, steep_from)]
@@ -134,13 +136,20 @@ def _listed(spans: _Spans, steep_from: np.ndarray) -> Cells:
     where = (spans.row, spans.begin, spans.columns, spans.shape[1], steep)
     _count(*where, counts, base, last)
     lists = np.zeros(3 * cells + 1, np.uint32)
-    pairs = _place(counts, base, lists)
+    pairs, longest = _place(counts, base, lists)
     wide = bool((last - base >= SHORT).any())
     entries = np.zeros(2 * pairs, np.uint32 if wide else np.uint16)
     _fill(*where, lists, np.zeros((cells, 2), np.uint32), entries)
     count, steeps = counts.sum(axis=0, dtype=np.int64)
     return Cells(
-        spans.side, spans.first, spans.shape, lists, entries, int(count + steeps), int(steeps)
+        side=spans.side,
+        first=spans.first,
+        shape=spans.shape,
+        lists=lists,
+        entries=entries,
+        count=int(count + steeps),
+        steep=int(steeps),
+        longest=longest,
     )
 
 
@@ -260,16 +269,17 @@ def _count(row, begin, columns, across, steep, counts, base, last):
 
 @jit
 def _place(counts, base, lists):
-    """Where each list begins; returns how many pairs there are in all."""
-    pairs = 0
+    """Where each list begins; returns how many pairs there are in all and in the longest."""
+    pairs, longest = 0, 0
     for cell in range(counts.shape[0]):
-        lists[3 * cell] = pairs
-        pairs += (counts[cell, 0] + 1) // 2
-        lists[3 * cell + 1] = pairs
-        pairs += (counts[cell, 1] + 1) // 2
         lists[3 * cell + 2] = base[cell]
+        for which in range(2):
+            lists[3 * cell + which] = pairs
+            length = (counts[cell, which] + 1) // 2
+            pairs += length
+            longest = max(longest, length)
     lists[3 * counts.shape[0]] = pairs
-    return pairs
+    return pairs, longest
 
 
 @jit

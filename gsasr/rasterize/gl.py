@@ -41,6 +41,7 @@ __all__ = [
 TARGETS = {"f2": "rgba16f", "f4": "rgba32f"}
 BLOCK = 4096  # widest piece that `render` draws at once, pixels
 PIXELS = 1 << 22  # most pixels in such a piece: 64 MiB
+PORTION = 1 << 15  # most pairs of a list that are read at once: llvmpipe ends loops at 2^16
 HELD = 1 << 29  # bytes of tiles that `render` holds on the GPU at once, about
 
 
@@ -56,6 +57,7 @@ class GlLevel:
     wide: bool
     ordinary: int  # entries in ordinary lists, and in steep ones
     steep: int
+    longest: int
 
 
 @dataclass(frozen=True)
@@ -172,6 +174,7 @@ class GlRasterizer:
                 cells.wide,
                 cells.count - cells.steep,
                 cells.steep,
+                cells.longest,
             )
             for i, cells in enumerate(tile.levels)
         )
@@ -288,9 +291,14 @@ class GlRasterizer:
         buffers = (tile.records, level.lists, level.entries, runs.buffer)
         for binding, buffer in enumerate(buffers):
             buffer.bind_to_storage_buffer(binding)
-        across, down = self.shape.threads
-        program.run(-(-int(x1 - x0) // across), -(-int(y1 - y0) // down))
-        self.ctx.memory_barrier(moderngl.SHADER_IMAGE_ACCESS_BARRIER_BIT)
+        across, down = (
+            -(-int(count) // threads)
+            for count, threads in zip((x1 - x0, y1 - y0), self.shape.threads, strict=True)
+        )
+        for start in range(0, level.longest, PORTION):
+            program["portion"] = start, start + PORTION
+            program.run(across, down)
+            self.ctx.memory_barrier(moderngl.SHADER_IMAGE_ACCESS_BARRIER_BIT)
 
     def _program(self, variant: _Variant) -> moderngl.ComputeShader:
         if variant not in self._programs:

@@ -51,7 +51,7 @@ def render(
     # The GPU draws all at once; elsewhere tile by tile, so that progress can be told.
     tiles = split_tiles(field) if backend == "cpu" else [field]
     parts = ((tile, number / len(tiles)) for number, tile in enumerate(tiles, start=1))
-    return _sum_of(parts, view, backend, antialias, progress, cancelled)
+    return sum_of(parts, view, backend, antialias, progress, cancelled)
 
 
 def upscale(
@@ -76,10 +76,10 @@ def upscale(
     if condition is None:
         condition = conditioning_scale(max(view.scale))
     parts = predict_tiles(model, image, condition, tile, precision, cancelled=cancelled)
-    return _sum_of(parts, view, backend, antialias, progress, cancelled)
+    return sum_of(parts, view, backend, antialias, progress, cancelled)
 
 
-def _sum_of(
+def sum_of(
     parts: Iterable[tuple[Gaussians, float]],
     view: View,
     backend: str,
@@ -87,7 +87,7 @@ def _sum_of(
     progress: Callable[[float], None],
     cancelled: Callable[[], bool],
 ) -> np.ndarray:
-    """The picture that all parts, each with the share done after it, add up to."""
+    """(h, w, 3) float32: what parts of a field, each with the share done after it, add up to."""
     require_picture(view.size)
     picture = np.zeros((*view.size, 3), np.float32)
     for part, share in parts:

@@ -12,6 +12,8 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -374,30 +376,38 @@ def cancel_prediction(ui: Ui, folder: Path) -> None:
     assert ui.pixels().std() > 0.05
 
 
-def a_picture_too_large_is_predicted_where_one_looks(ui: Ui, folder: Path) -> None:
+def a_large_picture_comes_and_goes_by_tiles(ui: Ui, folder: Path) -> None:
     from PIL import Image
 
-    from gsasr import image
-    from viewer import loading
+    from gsasr import image, load_model
+    from gsasr.predict import predict
 
     path, target = folder / "wide.png", folder / "wide-view.png"
     rng = np.random.default_rng(0)
-    Image.fromarray(rng.integers(0, 255, (40, 900, 3), dtype=np.uint8)).save(path)
-    before, loading.MOST = loading.MOST, 80_000
+    Image.fromarray(rng.integers(0, 255, (90, 900, 3), dtype=np.uint8)).save(path)
+    model = load_model(str(folder / "model.safetensors"))
+    field = predict(model, image.read(path).color, 4.0, tile=192)
+    most = ui.session.state.gpu_memory
     try:
-        ui.session.open(path)
-        ui.until(lambda: ui.session.state.document.path == path)
-        ui.rest()
-        document = ui.session.state.document
-        assert document.partial and not ui.session.ready
-        assert 0 < document.count <= 80_000
-        assert not ui.session.scene.covers(ui.view())
-        ui.on_window(lambda: ui.session.camera.look_at(870, 20, 16.0))
-        ui.until(lambda: ui.session.scene.covers(ui.view()))
-        ui.rest()
-        assert document.count <= 80_000
+        with counted_predictions() as predicted:
+            ui.session.open(path)
+            ui.until(lambda: showing(ui.session, path))
+            ui.rest()
+            assert ui.session.ready and len(predicted) == 5
+            tiles = ui.session.state.document.tiles
+            assert tiles.shown_bytes < most  # all five fit; now two do
+            ui.on_window(lambda: ui.session.set_gpu_memory(tiles.shown_bytes // 2))
+            assert 0 < tiles.shown_bytes <= ui.session.state.gpu_memory
+            for x in (30, 870, 450, 30):
+                ui.on_window(lambda x=x: ui.session.camera.look_at(x, 40, 16.0))
+                ui.until(lambda: ui.session.scene.covers(ui.view()))
+                ui.rest()
+                assert tiles.shown_bytes <= ui.session.state.gpu_memory
+                near = (field.mean[:, 0] - x).abs() < 30
+                assert_shows(ui.pixels(), field[near], ui.view(), step=13)
+            assert len(predicted) == 5  # what came back came from memory
         shown, view = ui.pixels(), ui.view()
-        # An export has all of them, and the same pixels.
+        # An export has the same pixels.
         ui.press("Ctrl+E")
         ui.ctx.item_click("//###Export/Current view")
         ui.ctx.item_input_value("//###Export/File", str(target))
@@ -405,11 +415,69 @@ def a_picture_too_large_is_predicted_where_one_looks(ui: Ui, folder: Path) -> No
         ui.ctx.item_click("//###Export/Export")
         ui.rest()
         written = image.read(target).color
-        top, right = max(0, round(view.to_output(0, 0)[1])), written.shape[1]
-        part = shown[top : top + written.shape[0], :right]
+        left, top = (max(0, round(side)) for side in view.to_output(0, 0))
+        part = shown[top : top + written.shape[0], left : left + written.shape[1]]
         assert np.abs(part - written).max() <= 1.51 / 255
     finally:
-        loading.MOST = before
+        ui.session.state.gpu_memory = most
+
+
+def showing(session, path: Path) -> bool:
+    return session.state.document is not None and session.state.document.path == path
+
+
+@contextmanager
+def counted_predictions():
+    """A list that grows by one with each tile that is predicted."""
+    module = import_module("gsasr.predict")  # whose name in the package is a function's
+    predicted, predict_tile = [], module.predict_tile
+
+    def counted(model, picture, tile, *options):
+        predicted.append(tile)
+        return predict_tile(model, picture, tile, *options)
+
+    module.predict_tile = counted
+    try:
+        yield predicted
+    finally:
+        module.predict_tile = predict_tile
+
+
+def a_full_gpu_is_a_message_and_a_smaller_budget(ui: Ui, folder: Path) -> None:
+    from PIL import Image
+
+    from gsasr.errors import BackendError
+
+    path = folder / "wide.png"
+    rng = np.random.default_rng(0)
+    Image.fromarray(rng.integers(0, 255, (40, 900, 3), dtype=np.uint8)).save(path)
+    session, most = ui.session, ui.session.state.gpu_memory
+    upload = type(session.scene).add_tile
+
+    def full(scene, packed) -> None:
+        if session.state.document.tiles.shown_bytes > 6_000_000:
+            raise BackendError("full")
+        upload(scene, packed)
+
+    type(session.scene).add_tile = full
+    try:
+        session.open(path)
+        ui.until(lambda: showing(session, path))
+        ui.rest()
+        message = session.state.message
+        assert message.error and "room" in message.text and message.text.count(". ") == 0
+        assert session.ready and not session.worker.tasks
+        tiles = session.state.document.tiles
+        assert 0 < tiles.shown_bytes <= session.state.gpu_memory < most
+        # It goes on: what one looks at comes all the same.
+        ui.on_window(lambda: session.camera.look_at(20, 20, 16.0))
+        ui.until(lambda: session.scene.covers(ui.view()))
+        ui.on_window(lambda: session.camera.look_at(880, 20, 16.0))
+        ui.until(lambda: session.scene.covers(ui.view()))
+        ui.rest()
+    finally:
+        type(session.scene).add_tile, session.state.gpu_memory = upload, most
+        session.state.message = None
 
 
 def errors_are_shown(ui: Ui, folder: Path) -> None:
@@ -457,7 +525,8 @@ SCENARIOS = (
     export_errors_are_shown,
     open_another_by_drop,
     cancel_prediction,
-    a_picture_too_large_is_predicted_where_one_looks,
+    a_large_picture_comes_and_goes_by_tiles,
+    a_full_gpu_is_a_message_and_a_smaller_budget,
     errors_are_shown,
     typing_is_not_taken_for_keys,
 )

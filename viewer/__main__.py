@@ -20,7 +20,13 @@ def main(argv: list[str] | None = None) -> int:
         else:
             from . import app
 
-            app.run(options.file, options.model, options.condition, options.size)
+            app.run(
+                options.file,
+                options.model,
+                options.condition,
+                options.size,
+                gpu_memory=options.gpu_memory,
+            )
     except GsasrError as error:
         print(f"gsasr-viewer: {error}", file=sys.stderr)
         return 2

@@ -10,19 +10,26 @@ from collections.abc import Callable
 from imgui_bundle import hello_imgui  # isort: skip
 import glfw
 import moderngl
+from imgui_bundle import portable_file_dialogs as native
 from imgui_bundle.glfw_utils import glfw_window_hello_imgui
 
 from gsasr.errors import BackendError
+from gsasr.rasterize.driver import lost
 
 from . import canvas, help, menu, overlay_panel, status, theme
 from .export_dialog import ExportDialog, PredictDialog
-from .file_dialogs import OpenDialog, SaveDialog
+from .file_dialogs import OpenDialog, SaveDialog, has_native
+from .memory_dialog import MemoryDialog
 from .scene import Scene
 from .session import Session
 
 TITLE = "GSASR"
 BUSY_FPS, IDLE_FPS = 10.0, 1.0  # without input; input is handled at once in any case
 RESULTS = 0.006  # seconds per frame for what the worker has sent
+LOST = (
+    "The graphics driver was reset, and all that was on the GPU is gone; "
+    "nothing unsaved is lost, so open the picture again."
+)
 WITHOUT = "render without a window by --snapshot OUT.png."
 
 
@@ -33,8 +40,15 @@ class App:
         self.session = session
         self.dialogs = {
             dialog.name: dialog
-            for dialog in (OpenDialog(), SaveDialog(), ExportDialog(), PredictDialog())
+            for dialog in (
+                OpenDialog(),
+                SaveDialog(),
+                ExportDialog(),
+                PredictDialog(),
+                MemoryDialog(),
+            )
         }
+        self.lost = False
         self._path = path  # opened after the first frame, so that the window is there at once
         self._frames = 0
         self._title = TITLE
@@ -55,6 +69,10 @@ class App:
     def frame(self) -> None:
         """One frame."""
         session = self.session
+        if self.lost or lost(session.scene.ctx):
+            self.lost = True  # there is nothing left to draw with, not even a message
+            hello_imgui.get_runner_params().app_shall_exit = True
+            return
         if session.worker.deliver(RESULTS):
             hello_imgui.request_refresh()
         menu.handle_keys(session)
@@ -95,14 +113,17 @@ def run(
     condition: float,
     size: tuple[int, int],
     tests: Callable[[App], None] | None = None,
+    gpu_memory: int | None = None,
 ) -> None:
     """Show the window until it is closed.
 
     path: what to open; size: of the window (width, height). tests: registers tests of Dear
-    ImGui's test engine. Raises BackendError where no window can be opened.
+    ImGui's test engine. gpu_memory: see Session. Raises BackendError where no window can be
+    opened, and where the driver was reset while it was open.
     """
     require_window()
-    session = Session(model, condition)
+    glfw.window_hint(glfw.CONTEXT_ROBUSTNESS, glfw.LOSE_CONTEXT_ON_RESET)  # so that `lost` tells
+    session = Session(model, condition, gpu_memory)
     app = App(session, path)
     params = hello_imgui.RunnerParams()
     params.app_window_params.window_title = TITLE
@@ -133,6 +154,15 @@ def run(
         hello_imgui.run(params)
     finally:
         session.worker.stop()
+    if app.lost:
+        raise BackendError(_tell(LOST))
+
+
+def _tell(sentence: str) -> str:
+    """The sentence, shown by the desktop where it can, as our window is no more."""
+    if has_native():
+        native.message(TITLE, sentence, native.choice.ok, native.icon.error).result()
+    return sentence
 
 
 def require_window() -> None:

@@ -10,7 +10,7 @@ from typing import NoReturn
 from gsasr.errors import RequestError
 
 from .loading import check_path
-from .state import CONDITION, OVERLAYS, SIGMA, TOLD
+from .state import CONDITION, LEAST_MEMORY, OVERLAYS, SIGMA, TOLD
 
 
 class _Parser(argparse.ArgumentParser):
@@ -35,6 +35,12 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument(
         "--size", type=_size, default=(1280, 800), metavar="WxH", help="of the window or snapshot"
+    )
+    parser.add_argument(
+        "--gpu-memory",
+        type=_bytes,
+        metavar="SIZE",
+        help="of Gaussians on the GPU: 512M, 2G (most of what the driver says is free)",
     )
     group = parser.add_argument_group("without a window")
     group.add_argument("--snapshot", type=Path, metavar="OUT.png", help="render a view to a file")
@@ -69,6 +75,14 @@ def _number(text: str) -> float:
     return value
 
 
+def _bytes(text: str) -> int:
+    units = {"M": 1 << 20, "G": 1 << 30}
+    size = int(_number(text[:-1]) * units[text[-1:].upper()])
+    if size < LEAST_MEMORY:
+        raise ValueError
+    return size
+
+
 def _size(text: str) -> tuple[int, int]:
     width, height = (int(side) for side in text.lower().split("x"))
     if not (1 <= width <= 16384 and 1 <= height <= 16384):
@@ -81,4 +95,5 @@ def _point(text: str) -> tuple[float, float]:
     return x, y
 
 
-_number.__name__, _size.__name__, _point.__name__ = "number", "WxH", "X,Y"
+_number.__name__, _bytes.__name__, _size.__name__ = "number", "size", "WxH"
+_point.__name__ = "X,Y"

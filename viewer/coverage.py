@@ -30,24 +30,11 @@ class Coverage:
 
     def add(self, core: Rectangle) -> None:
         """All Gaussians of a rectangle (source pixels) have arrived."""
-        rows, columns = self._arrived.shape
-        x0, y0, x1, y1 = (round(side / BLOCK) for side in core)
-        self._arrived[y0 : min(y1, rows), x0 : min(x1, columns)] = True
-        # Only blocks near the rectangle can have become complete.
-        left, top = max(0, x0 - EDGE), max(0, y0 - EDGE)
-        right, bottom = min(columns, x1 + EDGE), min(rows, y1 + EDGE)
-        if left >= right or top >= bottom:
-            return
-        around = np.pad(self._arrived, EDGE, constant_values=True)[
-            top : bottom + 2 * EDGE, left : right + 2 * EDGE
-        ]
-        windows = np.lib.stride_tricks.sliding_window_view(around, (2 * EDGE + 1,) * 2)
-        complete = self._complete[top:bottom, left:right] = windows.all((2, 3))
-        self.texture.write(
-            np.where(complete, 255, 0).astype(np.uint8).tobytes(),
-            viewport=(left, top, right - left, bottom - top),
-            alignment=1,
-        )
+        self._set(core, True)
+
+    def remove(self, core: Rectangle) -> None:
+        """Those of a rectangle are gone again."""
+        self._set(core, False)
 
     def clear(self) -> None:
         """Nothing has arrived."""
@@ -67,3 +54,23 @@ class Coverage:
     def release(self) -> None:
         """Free the texture."""
         self.texture.release()
+
+    def _set(self, core: Rectangle, arrived: bool) -> None:
+        rows, columns = self._arrived.shape
+        x0, y0, x1, y1 = (round(side / BLOCK) for side in core)
+        self._arrived[y0 : min(y1, rows), x0 : min(x1, columns)] = arrived
+        # Only blocks near the rectangle can have become complete, or ceased to be.
+        left, top = max(0, x0 - EDGE), max(0, y0 - EDGE)
+        right, bottom = min(columns, x1 + EDGE), min(rows, y1 + EDGE)
+        if left >= right or top >= bottom:
+            return
+        around = np.pad(self._arrived, EDGE, constant_values=True)[
+            top : bottom + 2 * EDGE, left : right + 2 * EDGE
+        ]
+        windows = np.lib.stride_tricks.sliding_window_view(around, (2 * EDGE + 1,) * 2)
+        complete = self._complete[top:bottom, left:right] = windows.all((2, 3))
+        self.texture.write(
+            np.where(complete, 255, 0).astype(np.uint8).tobytes(),
+            viewport=(left, top, right - left, bottom - top),
+            alignment=1,
+        )

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
-
-import numpy as np
 
 from gsasr.errors import RequestError
 from gsasr.view import View, output_length
 
 from .state import Document
 from .worker import Task
+
+BEYOND = 3  # output pixels by which antialiasing lets a Gaussian reach further, at most
 
 
 def region_of(view: View, size: tuple[int, int]) -> View:
@@ -56,37 +55,32 @@ def export(
     view: View,
     path: Path,
     antialias: bool,
-    upscale: Callable[[Task, View], np.ndarray],
 ) -> None:
     """Render the Gaussians through a view, exactly, and write them to a picture file.
 
     antialias: integrate over each pixel (see gsasr.render).
-    upscale: makes the (h, w, 3) picture where not all Gaussians are in memory.
 
+    Those of the tiles that are not in memory are predicted, and not kept.
     The source's alpha, gray, depth and colour profile are kept where the format holds them.
     Raises GsasrError; a cancelled or failed export leaves no file.
     """
     from gsasr import image
     from gsasr.memory import require_picture
+    from gsasr.picture import sum_of
 
     image.check_output(path, view.size, document.has_alpha)
     require_picture(view.size)
     task.progress(0.0)
-    if document.complete:
-        from gsasr.gaussians import Gaussians
-        from gsasr.picture import render
-
-        field = Gaussians.concatenate(document.parts)
-        color = render(
-            field,
-            view=view,
-            backend="cpu",
-            antialias=antialias,
-            progress=task.progress,
-            cancelled=task.cancelled,
-        )
-    else:
-        color = upscale(task, view)
+    height, width = view.size
+    wider = View(
+        view.to_source(-BEYOND, -BEYOND), view.scale, (height + 2 * BEYOND, width + 2 * BEYOND)
+    )
+    visible = document.tiles.visible(wider)
+    parts = (
+        (document.tiles.gaussians(index), number / len(visible))
+        for number, index in enumerate(visible, start=1)
+    )
+    color = sum_of(parts, view, "cpu", antialias, task.progress, task.cancelled)
     alpha = None
     if document.has_alpha:
         from gsasr.picture import resample_alpha

@@ -29,10 +29,6 @@ def _open_picture(session: Session) -> bool:
     return document is not None and document.picture is not None
 
 
-def _has_document(session: Session) -> bool:
-    return session.state.document is not None
-
-
 def _busy(session: Session) -> bool:
     return bool(session.worker.tasks)
 
@@ -44,7 +40,7 @@ COMMANDS = (
         ("Ctrl+E",),
         "File",
         lambda s: s.toggle_dialog("Export"),
-        enabled=_has_document,
+        enabled=lambda s: s.can_export,
     ),
     Command(
         "Save Gaussians...",
@@ -64,9 +60,10 @@ COMMANDS = (
         "Cancel what is running",
         ("Ctrl+.",),
         "File",
-        lambda s: s.worker.cancel_all(),
+        Session.cancel,
         enabled=_busy,
     ),
+    Command("GPU memory...", ("Ctrl+G",), "File", lambda s: s.toggle_dialog("Memory")),
     Command("Quit", ("Ctrl+Q",), "File", Session.quit),
     Command("Fit", ("F", "Home"), "View", Session.fit),
     Command("1:1", ("1", "Keypad 1"), "View", Session.one_to_one),

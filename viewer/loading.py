@@ -1,4 +1,4 @@
-"""From a file to Gaussians that can be drawn, on the worker's thread.
+"""From a file to a document and the tiles of its Gaussians, on the worker's thread.
 
 The network and its libraries take a second or two to import, so everything here that needs
 them is imported when first used; the picture itself is on screen before that.
@@ -7,7 +7,7 @@ them is imported when first used; the picture itself is on screen before that.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,16 +17,12 @@ from gsasr.errors import FieldError, ImageError
 from gsasr.files import require_file
 
 from .state import Document, Rectangle
+from .store import TileStore
 from .worker import Task
-
-MOST = 12_000_000  # Gaussians held of one document: about 1.7 GB on the GPU and 0.4 GB beside
-BYTES = 190  # that one takes: 36 as tensors, and its records and lists
 
 if TYPE_CHECKING:
     from gsasr.gaussians import Gaussians
     from gsasr.model import GSASR
-    from gsasr.predict import Tile
-    from gsasr.view import View
 
 FIELD_SUFFIX = ".safetensors"
 TILE = 192  # side of a tile, source pixels
@@ -39,8 +35,8 @@ class Loader:
         self._model: GSASR | None = None
         self._model_name: tuple[str, float] | None = None
 
-    def open(self, task: Task, path: Path) -> tuple[Document, list[tuple[Gaussians, Rectangle]]]:
-        """The document in a file, and for a saved field its tiles as (Gaussians, rectangle).
+    def open(self, task: Task, path: Path) -> Document:
+        """The document in a file; that of a saved field has all its tiles, a picture none yet.
 
         Raises ImageError or FieldError in one sentence.
         """
@@ -49,11 +45,9 @@ class Loader:
         from gsasr import image
 
         picture = image.read(path)
-        return Document(path, to_rgba(picture.color, picture.alpha), picture), []
+        return Document(path, to_rgba(picture.color, picture.alpha), picture)
 
-    def _open_field(
-        self, task: Task, path: Path
-    ) -> tuple[Document, list[tuple[Gaussians, Rectangle]]]:
+    def _open_field(self, task: Task, path: Path) -> Document:
         from gsasr import rasterize
         from gsasr.gaussians import Gaussians
         from gsasr.memory import require_picture
@@ -66,25 +60,16 @@ class Loader:
         task.check()
         # What one sees below 1:1 is the field itself, rendered once at 1:1.
         color = rasterize.render(field, View.at_scale(field.size, 1.0), "cpu", "screen").numpy()
-        document = Document(
-            path, to_rgba(color, None), model=field.model or "saved field", condition=field.scale
-        )
-        return document, list(split(field))
+        parts = list(split(field))
+        tiles = TileStore([core for _, core in parts])
+        for index, (part, _) in enumerate(parts):
+            task.check()
+            tiles.keep(index, part)
+        model = field.model or "saved field"
+        return Document(path, to_rgba(color, None), None, tiles, model, field.scale)
 
-    def predict(
-        self,
-        task: Task,
-        document: Document,
-        model_name: str,
-        condition: float,
-        near: Callable[[], tuple[float, float]],
-        within: tuple[float, float, float, float] | None = None,
-    ) -> Iterator[tuple[Gaussians, Rectangle]]:
-        """Gaussians tile by tile with the rectangle each completes, nearest to `near()` first.
-
-        within: (x0, y0, x1, y1); only the tiles that meet it. Of a picture too large to hold all,
-        the nearest: document.partial is then set. Raises Cancelled, CheckpointError.
-        """
+    def plan(self, task: Task, document: Document, model_name: str, condition: float) -> TileStore:
+        """The tiles of a picture, none of them predicted yet. Raises CheckpointError."""
         task.progress(None, "Loading the network")
         model = self._load(model_name)
         task.check()
@@ -92,51 +77,11 @@ class Loader:
 
         image = document.picture.color
         check(image, condition)
-        document.model, document.condition, document.partial = model.name, condition, False
-        most, total_count = _affordable(), 0
-        title = f"Predicting {document.path.name}"
-        task.progress(0.0, title)
-        waiting = [tile for tile in plan(model, document.size, TILE) if _meets(tile, within)]
-        total = len(waiting)
-        while waiting:
-            task.check()
-            x, y = near()
-            tile = min(
-                waiting,
-                key=lambda t: ((t.x0 + t.x1) / 2 - x) ** 2 + ((t.y0 + t.y1) / 2 - y) ** 2,
-            )
-            waiting.remove(tile)
-            part = predict_tile(model, image, tile, condition)
-            task.progress(1 - len(waiting) / total)
-            yield part, (tile.x0, tile.y0, tile.x1, tile.y1)
-            total_count += len(part)
-            if total_count + len(part) > most and waiting:
-                document.partial = True
-                return
-
-    def upscale(
-        self,
-        task: Task,
-        document: Document,
-        model_name: str,
-        condition: float,
-        view: View,
-        antialias: bool,
-    ) -> np.ndarray:
-        """(h, w, 3) float32: a picture through a view, without holding its Gaussians."""
-        model = self._load(model_name)
-        from gsasr.picture import upscale
-
-        image = document.picture.color
-        return upscale(
-            model,
-            image,
-            view,
-            condition,
-            backend="cpu",
-            antialias=antialias,
-            progress=task.progress,
-            cancelled=task.cancelled,
+        document.model, document.condition = model.name, condition
+        tiles = plan(model, document.size, TILE)
+        return TileStore(
+            [(tile.x0, tile.y0, tile.x1, tile.y1) for tile in tiles],
+            lambda index: predict_tile(model, image, tiles[index], condition),
         )
 
     def _load(self, name: str) -> GSASR:
@@ -151,20 +96,6 @@ class Loader:
             self._model = gsasr.load_model(name)
             self._model_name = (name, changed)
         return self._model
-
-
-def _affordable() -> int:
-    """How many Gaussians of a document to hold at once."""
-    from gsasr.memory import available
-
-    return int(min(MOST, available() / 3 / BYTES))
-
-
-def _meets(tile: Tile, within: tuple[float, float, float, float] | None) -> bool:
-    if within is None:
-        return True
-    x0, y0, x1, y1 = within
-    return tile.x0 < x1 and x0 < tile.x1 and tile.y0 < y1 and y0 < tile.y1
 
 
 def to_rgba(color: np.ndarray, alpha: np.ndarray | None) -> np.ndarray:

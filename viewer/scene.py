@@ -22,6 +22,7 @@ from .coverage import Coverage
 from .state import Rectangle
 
 if TYPE_CHECKING:
+    from gsasr.rasterize.gl import GlTile
     from gsasr.rasterize.tiles import PackedTile
 
 FULL = 2.0  # scale from which only Gaussians are shown
@@ -72,7 +73,9 @@ class Scene:
     def __init__(self, ctx: moderngl.Context) -> None:
         self.ctx = ctx
         self.size = (0, 0)  # (height, width) of the picture, source pixels
-        self.tiles: list = []
+        self._tiles: dict[Rectangle, list[GlTile]] = {}
+        self._arriving: list[GlTile] = []
+        self._changes = 0  # of the tiles so far
         self.overlay_drawn = True  # False where Gaussians lie too close together on the screen
         self._has_alpha = False
         self._rasterizer = None  # both need torch, which is not imported before the first tile
@@ -110,24 +113,52 @@ class Scene:
 
     def clear_tiles(self) -> None:
         """Forget the Gaussians, keep the picture."""
-        for tile in self.tiles:
-            tile.release()
-        self.tiles = []
+        self.drop_arriving()
+        for piece in self.tiles:
+            piece.release()
+        self._tiles = {}
+        self._changes += 1
         if self._coverage is not None:
             self._coverage.clear()
 
+    @property
+    def tiles(self) -> list[GlTile]:
+        """All that is drawn."""
+        return [piece for pieces in self._tiles.values() for piece in pieces]
+
     def add_tile(self, packed: PackedTile) -> None:
-        """Add Gaussians; nothing of them shows before `cover`. Raises BackendError: no memory."""
+        """Add Gaussians of a tile; none is drawn before `cover`. Raises BackendError: no memory."""
         if self._rasterizer is None:
             from gsasr.rasterize.gl import GlRasterizer
 
             self._rasterizer = GlRasterizer(self.ctx)
             self._rasterizer.warm_up()
-        self.tiles.append(self._rasterizer.upload(packed))
+        self._arriving.append(self._rasterizer.upload(packed))
 
-    def cover(self, core: Rectangle) -> None:
-        """All Gaussians of a rectangle have arrived: show them where its neighbours' have, too."""
+    def cover(self, core: Rectangle) -> int:
+        """What was added is all of a rectangle: show it where its neighbours' are there, too.
+
+        Returns the video memory that it takes, bytes.
+        """
+        arrived, self._arriving = self._arriving, []
+        self.uncover(core)
+        self._tiles[core] = arrived
+        self._changes += 1
         self._coverage.add(core)
+        return sum(piece.nbytes for piece in arrived)
+
+    def uncover(self, core: Rectangle) -> None:
+        """Forget the Gaussians of a rectangle, if they are there: the source is shown again."""
+        if core in self._tiles:
+            for piece in self._tiles.pop(core):
+                piece.release()
+            self._coverage.remove(core)
+            self._changes += 1
+
+    def drop_arriving(self) -> None:
+        """Forget what was added and not covered yet."""
+        while self._arriving:
+            self._arriving.pop().release()
 
     def covers(self, view: View) -> bool:
         """Are all Gaussians there of what a view shows of the picture?"""
@@ -144,7 +175,7 @@ class Scene:
 
     def share(self, scale: float) -> float:
         """How much of what is seen at a scale is Gaussians, in [0, 1]."""
-        if not self.tiles:
+        if not self._tiles:
             return 0.0
         t = min(max(math.log2(max(scale, 1e-9)) / math.log2(FULL), 0.0), 1.0)
         return t * t * (3 - 2 * t)
@@ -171,7 +202,7 @@ class Scene:
         start, stop = rows or (0, view.size[0])
         share = self.share(zoom or min(view.scale))
         marks = None
-        if overlay.kind != "none" and self.tiles:
+        if overlay.kind != "none" and self._tiles:
             start_time = time.perf_counter()
             marks = self._overlay_texture(view, overlay)
             self.ctx.finish()
@@ -252,7 +283,7 @@ class Scene:
             if self._marks is not None:
                 self._marks.release()
             self._marks, self._marks_of = Target(self.ctx, view.size), None
-        wanted = (view, overlay, tuple(map(id, self.tiles)))
+        wanted = (view, overlay, self._changes)
         if wanted != self._marks_of:
             target = self._marks.framebuffer
             target.clear(0.0, 0.0, 0.0, 0.0)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
-from gsasr.errors import GsasrError
+from gsasr.errors import BackendError, Cancelled, GsasrError
 from gsasr.view import View
 
 from . import export, loading
@@ -15,18 +14,30 @@ from .camera import Camera
 from .coverage import REACH
 from .painter import Painter
 from .scene import Overlay, Scene
-from .state import CONDITION, OVERLAYS, SIGMA, Document, Message, Rectangle, State
+from .state import (
+    CONDITION,
+    LEAST_MEMORY,
+    OVERLAYS,
+    SIGMA,
+    Document,
+    Message,
+    Rectangle,
+    State,
+)
+from .store import TileStore
 from .worker import Task, Worker
 
 NOTE_SECONDS = 6.0
 KEY_ZOOM = 0.5  # octaves per press of + or -
 KEY_PAN = 0.15  # of the canvas per press of an arrow
+ROOM = 0.9  # of what the GPU held when it was full that it may hold from then on
 
 
 class Session:
     """The document, the camera, the worker, and the actions on them."""
 
-    def __init__(self, model: str, condition: float) -> None:
+    def __init__(self, model: str, condition: float, gpu_memory: int | None = None) -> None:
+        """gpu_memory: bytes of Gaussians that the GPU may hold; by default as the driver tells."""
         self.state = State(model=model, condition=condition)
         self.camera = Camera()
         self.worker = Worker(on_error=self.fail)
@@ -34,10 +45,15 @@ class Session:
         self.painter: Painter | None = None
         self.quitting = False
         self._loader = loading.Loader()
+        self._gpu_memory = gpu_memory
+        self._stopped: View | None = None  # the view at which fetching tiles was cancelled
 
     def start(self, scene: Scene) -> None:
         """There is an OpenGL context now."""
+        from gsasr.rasterize.driver import video_memory
+
         self.scene, self.painter = scene, Painter(scene)
+        self.state.gpu_memory = self._gpu_memory or video_memory(scene.ctx).budget
 
     # Documents
 
@@ -53,11 +69,10 @@ class Session:
         model, condition = self.state.model, self.state.condition
 
         def work(task: Task) -> None:
-            document, tiles = self._loader.open(task, path)
+            document = self._loader.open(task, path)
             self.worker.show(task, lambda: self._show(document))
             if document.picture is not None:
-                tiles = self._loader.predict(task, document, model, condition, self._center)
-            self._arrive(task, document, tiles)
+                self._plan(task, document, model, condition)
 
         self.worker.post(f"Opening {path.name}", work)
 
@@ -69,33 +84,25 @@ class Session:
         condition = min(max(condition, CONDITION[0]), CONDITION[1])
         self.state.condition = condition
         self.worker.cancel_all()
-        document.complete = False
         model = self.state.model
-
-        def forget() -> None:
-            document.parts = []
-            self.scene.clear_tiles()
-            self.painter.invalidate()
-
-        def work(task: Task) -> None:
-            tiles = self._loader.predict(task, document, model, condition, self._center)
-            for number, tile in enumerate(tiles):
-                if number == 0:  # until then the old Gaussians stay on screen
-                    self.worker.show(task, forget)
-                self._arrive(task, document, [tile], last=False)
-            self.worker.show(task, lambda: self._complete(document))
-
-        self.worker.post(f"Predicting {document.path.name}", work)
+        self.worker.post(
+            f"Predicting {document.path.name}",
+            lambda task: self._plan(task, document, model, condition),
+        )
 
     def follow(self) -> None:
-        """Of a picture too large to hold all Gaussians, have those that one looks at."""
-        document, camera = self.state.document, self.camera
-        if document is None or not document.partial or camera.moving or self.worker.tasks:
+        """Once per frame: have the worker fetch tiles if there is something for it to do."""
+        tiles = self.state.document.tiles if self.state.document is not None else None
+        if tiles is None:
             return
-        view = camera.view()
-        center = View(self._center(), view.scale, (1, 1))
-        if view.scale[0] > 1 and not self.scene.covers(center):
-            self.predict(self.state.condition)
+        view = self.camera.view()
+        tiles.touch(view)
+        if self.worker.tasks or view == self._stopped or self._next_tile(tiles) is None:
+            return
+        document = self.state.document
+        self.worker.post(
+            f"Loading {document.path.name}", lambda task: self._fetch(task, document, tiles)
+        )
 
     def save_field(self, path: Path) -> None:
         """Save the Gaussians to a file that opens without the network."""
@@ -105,8 +112,12 @@ class Session:
             from dataclasses import replace
 
             from gsasr.gaussians import Gaussians
+            from gsasr.memory import require_field
 
-            field = Gaussians.concatenate(document.parts)
+            tiles = document.tiles
+            require_field(tiles.count)
+            parts = [tiles.gaussians(index) for index in range(len(tiles.cores))]
+            field = Gaussians.concatenate(parts)
             replace(field, source=document.path.name).save(path)
             self.worker.show(task, lambda: self.note(f"Saved {path}"))
 
@@ -116,23 +127,24 @@ class Session:
     def export(self, view: View, path: Path, antialias: bool) -> None:
         """Write the Gaussians through a view to a picture file; antialias: see gsasr.render."""
         document = self.state.document
-        model, condition = self.state.model, self.state.condition
-
-        def upscale(task: Task, view: View) -> np.ndarray:
-            return self._loader.upscale(task, document, model, condition, view, antialias)
 
         def work(task: Task) -> None:
-            export.export(task, document, view, path, antialias, upscale)
+            export.export(task, document, view, path, antialias)
             size = f"{view.size[1]}×{view.size[0]}"
             self.worker.show(task, lambda: self.note(f"Exported {size} pixels to {path}"))
 
-        if document is not None:
+        if self.can_export:
             self.worker.post(f"Exporting {path.name}", work)
 
     @property
     def ready(self) -> bool:
-        """Is there a document whose Gaussians have all arrived?"""
+        """Is there a document whose Gaussians are all held?"""
         return self.state.document is not None and self.state.document.complete
+
+    @property
+    def can_export(self) -> bool:
+        """Is there a document, and what makes its Gaussians?"""
+        return self.state.document is not None and self.state.document.tiles is not None
 
     # The view
 
@@ -169,6 +181,11 @@ class Session:
         """Draw ellipses at so many standard deviations."""
         self.state.sigma = min(max(sigma, SIGMA[0]), SIGMA[1])
 
+    def set_gpu_memory(self, size: int) -> None:
+        """Let the GPU hold so many bytes of Gaussians."""
+        self.state.gpu_memory = max(LEAST_MEMORY, size)
+        self._make_room()
+
     def toggle_dialog(self, name: str) -> None:
         """Open or close the dialog of that name."""
         self.state.dialogs ^= {name}
@@ -184,7 +201,12 @@ class Session:
         elif self.state.message is not None:
             self.state.message = None
         else:
-            self.worker.cancel_all()
+            self.cancel()
+
+    def cancel(self) -> None:
+        """Stop what is running; from now on only tiles that one goes to are predicted."""
+        self._stop()
+        self.worker.cancel_all()
 
     def quit(self) -> None:
         self.quitting = True
@@ -199,45 +221,89 @@ class Session:
 
     # From the worker
 
-    def _center(self) -> tuple[float, float]:
-        """The source point in the middle of the canvas; also asked by the worker."""
-        view = self.camera.view()
-        return view.to_source(view.size[1] / 2, view.size[0] / 2)
-
     def _show(self, document: Document) -> None:
         self.state.document = document
         self.state.message = None
+        self._stopped = None
         self.scene.set_picture(document.pixels)
         self.camera.set_picture(document.size)
         self.painter.reset()
 
-    def _arrive(self, task: Task, document: Document, tiles, last: bool = True) -> None:
-        """On the worker: pack each tile and hand it to the window."""
+    def _plan(self, task: Task, document: Document, model: str, condition: float) -> None:
+        """On the worker: have the tiles of a picture predicted from now on."""
+        tiles = self._loader.plan(task, document, model, condition)
+
+        def begin() -> None:
+            document.tiles, self._stopped = tiles, None
+
+        self.worker.show(task, begin)
+
+    def _next_tile(self, tiles: TileStore) -> tuple[int, bool] | None:
+        """What to fetch; once cancelled, no more than what one looks at."""
+        eager = self._stopped is None
+        return tiles.next(self.camera.view(), self.state.gpu_memory, eager)
+
+    def _fetch(self, task: Task, document: Document, tiles: TileStore) -> None:
+        """On the worker: one tile after another, until there are no more or another task waits."""
         from gsasr.rasterize.gl import pack, split_tiles
 
-        for part, core in tiles:
-            for piece in split_tiles(part):
+        try:
+            while self.worker.tasks == [task] and (wanted := self._next_tile(tiles)) is not None:
+                index, shown = wanted
+                what = "Loading" if tiles.holds(index) else "Predicting"
+                task.progress(tiles.share, f"{what} {document.path.name}")
+                gaussians = tiles.gaussians(index)
+                if not tiles.holds(index):
+                    tiles.keep(index, gaussians, self.camera.view())
                 task.check()
-                packed = pack(piece)
-                self.worker.show(task, lambda packed=packed: self._add(document, packed))
-            self.worker.show(task, lambda part=part, core=core: self._cover(document, part, core))
-        if last:
-            self.worker.show(task, lambda: self._complete(document))
+                if shown:
+                    pieces = [pack(piece) for piece in split_tiles(gaussians)]
+                    self.worker.carry_out(task, self._arrive(tiles, index, pieces))
+        except Cancelled:
+            raise
+        except Exception:
+            self.worker.show(None, self._stop)  # else it would begin again at once
+            raise
 
-    def _add(self, document: Document, packed) -> None:
-        if document is self.state.document:
-            self.scene.add_tile(packed)
+    def _stop(self) -> None:
+        self._stopped = self.camera.view()
 
-    def _cover(self, document: Document, part, core: Rectangle) -> None:
-        if document is not self.state.document:
+    def _arrive(self, tiles: TileStore, index: int, pieces: list) -> Iterator[None]:
+        """On the window's thread, over several frames: show a tile, and make room for it."""
+        core = tiles.cores[index]
+        if not tiles.any_shown:  # what is there is of an earlier prediction
+            self.scene.clear_tiles()
+            self.painter.invalidate()
+        try:
+            for piece in pieces:
+                self.scene.add_tile(piece)
+                yield
+            tiles.show(index, self.scene.cover(core))
+            self._repaint(core)
+        except BackendError:
+            held = tiles.shown_bytes
+            self.state.gpu_memory = int(ROOM * held)
+            self.fail(
+                f"The GPU has no room for more than {held / 2**20:.0f} MiB of Gaussians; "
+                "what does not fit shows as the source picture."
+            )
+        finally:
+            self.scene.drop_arriving()
+        self._make_room()
+
+    def _make_room(self) -> None:
+        """Take off the GPU what is beyond its budget."""
+        document = self.state.document
+        if document is None or document.tiles is None:
             return
-        document.parts.append(part)
-        self.scene.cover(core)
+        for index in document.tiles.evict(self.camera.view(), self.state.gpu_memory):
+            self.scene.uncover(document.tiles.cores[index])
+            self._repaint(document.tiles.cores[index])
+
+    def _repaint(self, core: Rectangle) -> None:
+        """The Gaussians of a rectangle have come or gone."""
         view = self.camera.view()
         left, top = view.to_output(core[0] - REACH, core[1] - REACH)
         right, bottom = view.to_output(core[2] + REACH, core[3] + REACH)
         if left < view.size[1] and right > 0:
             self.painter.invalidate((top, bottom))
-
-    def _complete(self, document: Document) -> None:
-        document.complete = not document.partial

@@ -10,12 +10,13 @@ from tqdm import tqdm
 
 from gsasr import image
 from gsasr.errors import BackendError, RequestError
+from gsasr.view import View
 
 from .camera import Camera
-from .coverage import REACH
 from .loading import Loader
 from .scene import Overlay, Scene, Target
-from .state import Document, Rectangle
+from .state import Document
+from .store import TileStore
 from .worker import Task
 
 
@@ -27,18 +28,15 @@ def run(options: argparse.Namespace) -> None:
     """
     image.check_output(options.snapshot)
     task, loader = Task("Snapshot"), Loader()
-    document, tiles = loader.open(task, Path(options.file))
+    document = loader.open(task, Path(options.file))
     camera = _camera(options, document)
     view = camera.view()
     scene = Scene(_context())
     scene.set_picture(document.pixels)
-    if document.picture is not None and (view.scale[0] > 1 or options.overlay != "none"):
-        left, top = view.to_source(0, 0)
-        right, bottom = view.to_source(view.size[1], view.size[0])
-        within = (left - REACH, top - REACH, right + REACH, bottom + REACH)
-        tiles = _predicted(loader, task, document, options, within)
-    for part, core in tiles:
-        _add(scene, part, core)
+    if view.scale[0] > 1 or options.overlay != "none":
+        if document.tiles is None:
+            document.tiles = loader.plan(task, document, options.model, options.condition)
+        _fill(scene, document.tiles, view)
     height, width = view.size
     target = Target(scene.ctx, (height, width))
     scene.draw(target, view, Overlay(options.overlay, options.sigma))
@@ -72,20 +70,12 @@ def _camera(options: argparse.Namespace, document: Document) -> Camera:
     return camera
 
 
-def _predicted(loader: Loader, task: Task, document: Document, options, within: Rectangle):
-    """The tiles that the view needs, with a progress bar where somebody may watch it."""
-    center = (within[0] + within[2]) / 2, (within[1] + within[3]) / 2
-    with tqdm(total=1.0, desc="Predicting", disable=None, bar_format="{l_bar}{bar}") as bar:
-        for tile in loader.predict(
-            task, document, options.model, options.condition, lambda: center, within
-        ):
-            yield tile
-            bar.update(task.share - bar.n)
-
-
-def _add(scene: Scene, part, core: Rectangle) -> None:
+def _fill(scene: Scene, tiles: TileStore, view: View) -> None:
+    """Have the scene draw the tiles of a view, with a progress bar where somebody may watch it."""
     from gsasr.rasterize.gl import pack, split_tiles
 
-    for piece in split_tiles(part):
-        scene.add_tile(pack(piece))
-    scene.cover(core)
+    visible = tiles.visible(view)
+    for index in tqdm(visible, "Gaussians", disable=None, bar_format="{l_bar}{bar}"):
+        for piece in split_tiles(tiles.gaussians(index)):
+            scene.add_tile(pack(piece))
+        scene.cover(tiles.cores[index])

@@ -9,13 +9,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from gsasr.gaussians import Gaussians
     from gsasr.image import Picture
+
+    from .store import TileStore
 
 OVERLAYS = ("none", "centers", "ellipses")
 SIGMA = (0.5, 4.0)  # least and greatest size of the drawn ellipses, standard deviations
 CONDITION = (1.0, 4.0)  # scales that the networks are trained for
 TOLD = 3.0  # the one told by default, as in gsasr.predict, which would load PyTorch
+
+LEAST_MEMORY = 1 << 24  # bytes of Gaussians that the user can let the GPU hold
 
 Rectangle = tuple[int, int, int, int]  # x0, y0, x1, y1 in source pixels
 
@@ -26,18 +29,14 @@ class Document:
 
     pixels: (H, W, 4) uint8, RGBA, sRGB-encoded: the source as the screen shows it.
     picture: what was read from a picture file; None for a saved field.
-    parts: the Gaussians that have arrived, one item per tile.
-    complete: whether all have arrived; partial: whether there are too many to hold, so that
-        only those around the view have.
-    model, condition: what made them.
+    tiles: its Gaussians; None before the network is there.
+    model, condition: what makes them.
     """
 
     path: Path
     pixels: np.ndarray
     picture: Picture | None = None
-    parts: list[Gaussians] = field(default_factory=list)
-    complete: bool = False
-    partial: bool = False
+    tiles: TileStore | None = None
     model: str = ""
     condition: float = 0.0
 
@@ -53,8 +52,13 @@ class Document:
 
     @property
     def count(self) -> int:
-        """How many Gaussians have arrived."""
-        return sum(len(part) for part in self.parts)
+        """How many Gaussians are held."""
+        return 0 if self.tiles is None else self.tiles.count
+
+    @property
+    def complete(self) -> bool:
+        """Are all Gaussians held?"""
+        return self.tiles is not None and self.tiles.complete
 
 
 @dataclass
@@ -74,6 +78,7 @@ class State:
     condition: float = TOLD
     overlay: str = "none"
     sigma: float = 2.0
+    gpu_memory: int = 0  # bytes of Gaussians that the GPU may hold
     document: Document | None = None
     message: Message | None = None
     cursor: tuple[float, float] | None = None  # canvas pixels, None when not over the canvas

@@ -75,6 +75,7 @@ def _facts(session: Session) -> None:
     if document.count:
         made = f"{document.model} at ×{document.condition:g}" if document.model else "no model"
         imgui.text(f"{document.count:,} Gaussians".replace(",", " "))
+        imgui.set_item_tooltip(memory_line(session))
         imgui.same_line(0, 1.5 * em)
         imgui.text_disabled(made)
         imgui.set_item_tooltip("The network, and the scale it was told to predict for")
@@ -85,6 +86,14 @@ def _facts(session: Session) -> None:
         imgui.same_line(0, 0.6 * em)
         imgui.text_disabled(f"1/{session.painter.reduction}")
         imgui.set_item_tooltip("Resolution in motion; it sharpens at rest")
+
+
+def memory_line(session: Session) -> str:
+    """What the Gaussians take, and what they may take of the GPU."""
+    tiles = session.state.document.tiles
+    shown, held = tiles.shown_bytes / 2**20, tiles.coded_bytes / 2**20
+    most = session.state.gpu_memory / 2**20
+    return f"{shown:.0f} of {most:.0f} MiB on the GPU, {held:.0f} MiB in main memory"
 
 
 def _progress(session: Session) -> None:
@@ -111,7 +120,7 @@ def _progress(session: Session) -> None:
     draw_list.pop_clip_rect()
     imgui.same_line()
     if imgui.button("Cancel"):
-        session.worker.cancel_all()
+        session.cancel()
 
 
 def draw_message(session: Session) -> None:

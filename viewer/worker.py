@@ -1,7 +1,7 @@
 """One background thread: the window posts work, the work sends back what the window should do.
 
-Only the window's thread touches OpenGL and the state; work therefore hands over plain callables,
-which the window runs between frames, a few at a time.
+Only the window's thread touches OpenGL and the state; work therefore hands over what to do there,
+which the window does between frames, a few steps at a time.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from gsasr.errors import Cancelled, GsasrError
 
@@ -50,13 +50,22 @@ Action = Callable[[], None]
 Work = Callable[[Task], None]
 
 
+class Result:
+    """What a task hands to the window's thread: steps to go through there."""
+
+    def __init__(self, task: Task | None, steps: Iterator[None]) -> None:
+        self.task, self.steps = task, steps
+        self.done = threading.Event()
+
+
 class Worker:
     """Runs tasks one after another on one thread, and their results on the window's thread."""
 
     def __init__(self, on_error: Callable[[str], None]) -> None:
         """on_error: called on the window's thread with one sentence."""
         self._on_error = on_error
-        self._results: queue.SimpleQueue[tuple[Task | None, Action]] = queue.SimpleQueue()
+        self._results: queue.SimpleQueue[Result] = queue.SimpleQueue()
+        self._present: Result | None = None  # begun, and not at its end
         self._tasks: list[Task] = []  # running and waiting, oldest first
         self._queue: queue.SimpleQueue[tuple[Task, Work] | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
@@ -71,9 +80,20 @@ class Worker:
         self._queue.put((task, work))
         return task
 
-    def show(self, task: Task, action: Action) -> None:
+    def show(self, task: Task | None, action: Action) -> None:
         """From the work: have the window's thread call `action`, unless cancelled by then."""
-        self._results.put((task, action))
+        self._results.put(Result(task, (action() for _ in range(1))))
+
+    def carry_out(self, task: Task, steps: Iterator[None]) -> None:
+        """From the work: have the window's thread go through `steps`, over several frames.
+
+        Returns at their end. Raises Cancelled if the task is; the steps are then closed.
+        """
+        result = Result(task, steps)
+        self._results.put(result)
+        while not result.done.wait(0.1):
+            task.check()
+        task.check()
 
     @property
     def tasks(self) -> list[Task]:
@@ -91,19 +111,27 @@ class Worker:
         deadline = time.perf_counter() + seconds
         ran = False
         while not ran or time.perf_counter() < deadline:
-            try:
-                task, action = self._results.get_nowait()
-            except queue.Empty:
-                break
+            if self._present is None:
+                try:
+                    self._present = self._results.get_nowait()
+                except queue.Empty:
+                    break
+            task, steps = self._present.task, self._present.steps
             if task is not None and task.cancelled():
-                continue
-            ran = True
-            try:
-                action()
-            except GsasrError as error:  # the GPU has no memory left, for one
-                if task is not None:
-                    task.cancel()
-                self._on_error(str(error))
+                steps.close()
+            else:
+                ran = True
+                try:
+                    next(steps)
+                    continue
+                except StopIteration:
+                    pass
+                except GsasrError as error:
+                    if task is not None:
+                        task.cancel()
+                    self._on_error(str(error))
+            self._present.done.set()
+            self._present = None
         return ran
 
     def stop(self, seconds: float = 2.0) -> None:
@@ -132,4 +160,4 @@ class Worker:
                     self._tasks.remove(task)
 
     def _fail(self, sentence: str) -> None:
-        self._results.put((None, lambda: self._on_error(sentence)))
+        self.show(None, lambda: self._on_error(sentence))

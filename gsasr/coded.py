@@ -97,7 +97,7 @@ def _encode(values, shape, paint, held):
             y = np.rint((math.log(std_y) - THINNEST) / STEP)
             turn = np.rint(0.5 * math.log((1.0 + rho) / (1.0 - rho)) / STEP) + ROUND
             low, high = min(x, y, turn), max(x, y, turn)
-            fits = 0.0 <= low and high <= SHAPE_LAST
+            fits = low >= 0.0 and high <= SHAPE_LAST
         if fits:
             shape[n] = np.uint64(x) | np.uint64(y) << SECOND | np.uint64(turn) << THIRD
         else:

@@ -55,7 +55,9 @@ def test_what_the_codes_cannot_hold_comes_back_to_the_bit(outside):
     mixed = Gaussians.concatenate([inside, outside, inside])
     back = coded.encode(mixed).decode()
     for name in TENSORS:
-        assert torch.equal(getattr(back[5:6], name).nan_to_num(), getattr(outside, name).nan_to_num())
+        assert torch.equal(
+            getattr(back[5:6], name).nan_to_num(), getattr(outside, name).nan_to_num()
+        )
     assert (back.std[:5] / inside.std - 1).abs().max() < 3e-5
 
 

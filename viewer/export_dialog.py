@@ -116,9 +116,7 @@ class ExportDialog:
         if session.worker.tasks:
             imgui.text_disabled("It begins when what is running has ended.")
         imgui.spacing()
-        imgui.begin_disabled(
-            view is None or not session.can_export or not self._path.text.strip()
-        )
+        imgui.begin_disabled(view is None or not session.can_export or not self._path.text.strip())
         if imgui.button("Export"):
             path = Path(self._path.text.strip()).expanduser()
             session.export(view, path, antialias=minified and self.antialias)

@@ -49,7 +49,7 @@ class TileStore:
         corners = np.array(cores, float).reshape(-1, 4)
         self._middle = (corners[:, :2] + corners[:, 2:]) / 2
         self._area = np.prod(corners[:, 2:] - corners[:, :2], axis=1)
-        self._reach = corners + (-REACH, -REACH, REACH, REACH)
+        self._reach = corners + np.array([-REACH, -REACH, REACH, REACH])
         self._coded: list[CodedGaussians | None] = [None] * len(cores)
         self._held = np.zeros(len(cores), bool)  # coded
         self._count = np.zeros(len(cores), np.int64)  # Gaussians, where coded
@@ -113,14 +113,14 @@ class TileStore:
         order = np.lexsort((distance, ~needed))
         size = self._shown_size.expected()
         first, rest = order[: needed.sum()], order[needed.sum() :]
-        fits = np.cumsum(size[first]) < budget
+        fits = (np.cumsum(size[first]) <= budget) & (budget > 0)
         missing = first[fits & ~self._shown[first]]
         if len(missing):
             return int(missing[0]), True
         if not eager:
             return None
         room = budget - self.shown_bytes
-        can_show = ~needed & (size < room)
+        can_show = ~needed & (size <= room) & (room > 0)
         can_code = self.coded_bytes + self._coded_size.expected() <= self._memory
         held = self._held
         worth = ~self._shown & ((held & can_show) | (~held & can_code))

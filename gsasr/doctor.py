@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from .errors import BackendError
 from .processor import cores
+from .rasterize.driver import VideoMemory
 
 # What the rasterizer minds: name in OpenGL -> what it is called here, unit
 GL_LIMITS = {
@@ -66,7 +67,7 @@ def _numba() -> Iterator[Finding]:
 
 
 def _opengl() -> Iterator[Finding]:
-    from .rasterize import gl
+    from .rasterize import driver, gl
 
     try:
         info = gl.driver()
@@ -79,6 +80,17 @@ def _opengl() -> Iterator[Finding]:
     yield Finding("OpenGL", f"{info['GL_VERSION']}, {info['GL_RENDERER']} ({kind})", advice)
     limits = (f"{name} {info[key]:,} {unit}" for key, (name, unit) in GL_LIMITS.items())
     yield Finding("OpenGL limits", "; ".join(limits))
+    yield Finding("GPU memory", _memory(driver.headless_memory()))
+
+
+def _memory(memory: VideoMemory) -> str:
+    told = [
+        f"{size / 2**30:.1f} GiB {what}"
+        for what, size in (("in all", memory.total), ("free", memory.free))
+        if size is not None
+    ]
+    told = told or ["the driver does not tell"]
+    return f"{', '.join(told)}; the viewer fills up to {memory.budget / 2**30:.1f} GiB"
 
 
 def _window() -> Iterator[Finding]:

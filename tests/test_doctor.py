@@ -25,6 +25,7 @@ def test_the_limits_of_opengl_are_asked_of_the_driver(gl_context):
     found = findings()
     assert gl_context.info["GL_RENDERER"] in found["OpenGL"].value
     assert f"{gl_context.info['GL_MAX_TEXTURE_SIZE']:,} pixels" in found["OpenGL limits"].value
+    assert "the viewer fills up to" in found["GPU memory"].value
 
 
 def test_what_is_missing_comes_with_advice(monkeypatch):

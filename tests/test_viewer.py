@@ -79,6 +79,33 @@ def test_mouse_and_keys_of_the_desktop(folder, display):
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+def test_the_gpu_memory_is_given_in_units():
+    from viewer import arguments
+
+    assert arguments.parse(["--gpu-memory", "1.5G"]).gpu_memory == 3 << 29
+    assert arguments.parse(["--gpu-memory", "512m"]).gpu_memory == 512 << 20
+    assert arguments.parse([]).gpu_memory is None
+
+
+def test_a_reset_of_the_driver_ends_in_one_sentence(folder, display, images):
+    script = (
+        "import sys; from viewer import __main__, app; frames = iter(range(10**6));"
+        "app.lost = lambda ctx: next(frames) > 5;"
+        "app.has_native = lambda: False;"
+        f"sys.exit(__main__.main([{str(images / 'cat.png')!r}]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=folder,
+        env=os.environ | {"DISPLAY": display, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 2
+    assert "reset" in done.stderr and done.stderr.count("\n") == 1, done.stderr
+
+
 def test_without_a_display_it_names_the_way_without_one(images):
     environment = {"DISPLAY": "", "WAYLAND_DISPLAY": ""}
     done = viewer(images / "cat.png", environment=environment)
@@ -94,6 +121,8 @@ def test_without_a_display_it_names_the_way_without_one(images):
         (["missing.safetensors"], "missing.safetensors does not exist"),
         (["."], "is a folder"),
         (["--size", "12"], "--size"),
+        (["--gpu-memory", "2"], "--gpu-memory"),
+        (["--gpu-memory", "1M"], "--gpu-memory"),
         (["--zoom", "-1", "--snapshot", "out.png"], "--zoom"),
         (["--snapshot", "out.png"], "picture"),
         (["--no-such-option"], "--no-such-option"),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import moderngl
@@ -48,6 +49,22 @@ def video_memory(ctx: moderngl.Context) -> VideoMemory:
     return VideoMemory(None, None, UNKNOWN)
 
 
+def headless_memory() -> VideoMemory:
+    """The same of a context of its own. Raises BackendError where there is none."""
+    from .gl import create_context
+
+    def ask() -> VideoMemory:
+        ctx = create_context()
+        try:
+            return video_memory(ctx)
+        finally:
+            ctx.release()
+
+    # On a thread of its own, as a new context would displace the caller's.
+    with ThreadPoolExecutor(1, thread_name_prefix="gl-memory") as thread:
+        return thread.submit(ask).result()
+
+
 def lost(ctx: moderngl.Context) -> bool:
     """Has the driver been reset, so that nothing drawn or stored in this context is left?
 
@@ -69,7 +86,8 @@ def _kibibytes(ctx: moderngl.Context, name: int) -> int | None:
 
 def _function(ctx: moderngl.Context, name: str, *signature):
     """An OpenGL function (result, arguments), or None where it is not to be had."""
-    # moderngl offers no other way to the loader of its context.
-    load = getattr(getattr(ctx.mglo, "_context", None), "load", None)
+    # moderngl offers no other way to the loader of its context, of which it has two kinds.
+    loader = getattr(ctx.mglo, "_context", None)
+    load = getattr(loader, "load", None) or getattr(loader, "load_opengl_function", None)
     address = load(name) if load is not None else 0
     return _SIGNATURE(*signature)(address) if address else None

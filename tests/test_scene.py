@@ -120,6 +120,25 @@ def test_where_gaussians_have_not_arrived_the_source_is_shown(scene):
     assert np.array_equal(show(scene, view), before)
 
 
+def test_a_tile_that_goes_leaves_the_source_and_its_neighbours(scene):
+    field = make_field((16, 600))
+    scene.set_picture(random_picture((16, 600)))
+    view = View((0, 2), (3.0, 3.0), (36, 1800))
+    before = show(scene, view)
+    add(scene, field)
+    whole = show(scene, view)
+    core = [core for _, core in split(field)][1]
+    scene.uncover(core)
+    after = show(scene, view)
+    assert not scene.covers(view)
+    assert np.array_equal(after[:, 3 * core[0] : 3 * core[2]], before[:, 3 * core[0] : 3 * core[2]])
+    edge = 3 * (core[0] - (EDGE + 1) * BLOCK)
+    assert np.array_equal(after[:, :edge], whole[:, :edge])
+    add(scene, field)  # as if it came back; those still there are replaced
+    assert scene.covers(view)
+    assert np.array_equal(show(scene, view), whole)
+
+
 def test_rows_drawn_one_band_after_another_are_the_whole(scene):
     field = make_field()
     scene.set_picture(random_picture())

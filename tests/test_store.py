@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from fields import one, random_field
@@ -9,8 +11,10 @@ from fields import one, random_field
 from gsasr.errors import BackendError
 from gsasr.gaussians import Gaussians
 from gsasr.view import View
-from viewer.session import Session
+from viewer.camera import Camera
+from viewer.state import State
 from viewer.store import TileStore
+from viewer.streaming import Streaming
 
 SIDE = 100
 COUNT = 50  # Gaussians of a tile
@@ -256,38 +260,31 @@ class FakePainter:
         pass
 
 
-class FakeDocument:
-    def __init__(self, tiles: TileStore) -> None:
-        self.tiles = tiles
-
-
 def test_a_full_gpu_makes_the_budget_smaller_and_says_so_and_goes_on():
-    session = Session("no network", 3.0)
-    session.worker.stop()
     store, network = make_store(10)
-    session.scene, session.painter = FakeScene(room=4), FakePainter()
-    session.state.document, session.state.gpu_memory = FakeDocument(store), 100 * BYTES
-    session.camera.resize(400, 400)
-    session.camera.set_picture((SIDE, 10 * SIDE))
+    scene, messages = FakeScene(room=4), []
+    state, camera = State(gpu_memory=100 * BYTES), Camera()
+    state.document = SimpleNamespace(tiles=store)
+    streaming = Streaming(state, camera, None, scene, FakePainter(), messages.append)
+    camera.resize(400, 400)
+    camera.set_picture((SIDE, 10 * SIDE))
 
     def work() -> None:
-        while (wanted := session._next_tile(store)) is not None:
+        while (wanted := streaming._next(store)) is not None:
             index, show = wanted
-            store.keep(index, store.gaussians(index), session.camera.view())
+            store.keep(index, store.gaussians(index), camera.view())
             if show:
-                for _ in session._arrive(store, index, ["one piece"]):
+                for _ in streaming._arrive(store, index, ["one piece"]):
                     pass
-                assert session.scene.arriving == 0
-                assert len(session.scene.there) == len(shown(store)) <= 4
+                assert scene.arriving == 0
+                assert len(scene.there) == len(shown(store)) <= 4
 
-    session.camera.look_at(50, 50, 4.0)
+    camera.look_at(50, 50, 4.0)
     work()
-    assert session.state.gpu_memory == int(0.9 * 4 * BYTES)
-    message = session.state.message
-    assert message.error and "room" in message.text
+    assert state.gpu_memory == int(0.9 * 4 * BYTES)
+    assert len(messages) == 1 and "room" in messages[0]
     assert store.complete and network.asked == sorted(set(network.asked))
-    session.state.message = None
-    session.camera.look_at(950, 50, 4.0)
+    camera.look_at(950, 50, 4.0)
     work()
-    assert store.cores[9] in session.scene.there
-    assert session.state.message is None  # the smaller budget is kept to
+    assert store.cores[9] in scene.there
+    assert len(messages) == 1  # the smaller budget is kept to

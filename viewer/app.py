@@ -86,7 +86,7 @@ class App:
             else:
                 self.dialogs[name].draw(session)
         status.draw_message(session)
-        session.follow()
+        session.streaming.follow()
         self._set_title()
         if session.camera.moving or session.painter.busy:
             hello_imgui.request_refresh()

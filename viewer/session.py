@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
-from gsasr.errors import BackendError, Cancelled, GsasrError
+from gsasr.errors import GsasrError
 from gsasr.view import View
 
 from . import export, loading
 from .camera import Camera
-from .coverage import REACH
 from .painter import Painter
 from .scene import Overlay, Scene
 from .state import (
@@ -21,16 +19,14 @@ from .state import (
     SIGMA,
     Document,
     Message,
-    Rectangle,
     State,
 )
-from .store import TileStore
+from .streaming import Streaming
 from .worker import Task, Worker
 
 NOTE_SECONDS = 6.0
 KEY_ZOOM = 0.5  # octaves per press of + or -
 KEY_PAN = 0.15  # of the canvas per press of an arrow
-ROOM = 0.9  # of what the GPU held when it was full that it may hold from then on
 
 
 class Session:
@@ -43,16 +39,19 @@ class Session:
         self.worker = Worker(on_error=self.fail)
         self.scene: Scene | None = None
         self.painter: Painter | None = None
+        self.streaming: Streaming | None = None
         self.quitting = False
         self._loader = loading.Loader()
         self._gpu_memory = gpu_memory
-        self._stopped: View | None = None  # the view at which fetching tiles was cancelled
 
     def start(self, scene: Scene) -> None:
         """There is an OpenGL context now."""
         from gsasr.rasterize.driver import video_memory
 
         self.scene, self.painter = scene, Painter(scene)
+        self.streaming = Streaming(
+            self.state, self.camera, self.worker, scene, self.painter, self.fail
+        )
         self.state.gpu_memory = self._gpu_memory or video_memory(scene.ctx).budget
 
     # Documents
@@ -88,20 +87,6 @@ class Session:
         self.worker.post(
             f"Predicting {document.path.name}",
             lambda task: self._plan(task, document, model, condition),
-        )
-
-    def follow(self) -> None:
-        """Once per frame: have the worker fetch tiles if there is something for it to do."""
-        tiles = self.state.document.tiles if self.state.document is not None else None
-        if tiles is None:
-            return
-        view = self.camera.view()
-        tiles.touch(view)
-        if self.worker.tasks or view == self._stopped or self._next_tile(tiles) is None:
-            return
-        document = self.state.document
-        self.worker.post(
-            f"Loading {document.path.name}", lambda task: self._fetch(task, document, tiles)
         )
 
     def save_field(self, path: Path) -> None:
@@ -184,7 +169,7 @@ class Session:
     def set_gpu_memory(self, size: int) -> None:
         """Let the GPU hold so many bytes of Gaussians."""
         self.state.gpu_memory = max(LEAST_MEMORY, size)
-        self._make_room()
+        self.streaming.make_room()
 
     def toggle_dialog(self, name: str) -> None:
         """Open or close the dialog of that name."""
@@ -205,7 +190,7 @@ class Session:
 
     def cancel(self) -> None:
         """Stop what is running; from now on only tiles that one goes to are predicted."""
-        self._stop()
+        self.streaming.stop()
         self.worker.cancel_all()
 
     def quit(self) -> None:
@@ -222,88 +207,19 @@ class Session:
     # From the worker
 
     def _show(self, document: Document) -> None:
-        self.state.document = document
-        self.state.message = None
-        self._stopped = None
         self.scene.set_picture(document.pixels)
         self.camera.set_picture(document.size)
         self.painter.reset()
+        self.state.message = None
+        self.streaming.restart()
+        self.state.document = document
 
     def _plan(self, task: Task, document: Document, model: str, condition: float) -> None:
         """On the worker: have the tiles of a picture predicted from now on."""
         tiles = self._loader.plan(task, document, model, condition)
 
         def begin() -> None:
-            document.tiles, self._stopped = tiles, None
+            document.tiles = tiles
+            self.streaming.restart()
 
         self.worker.show(task, begin)
-
-    def _next_tile(self, tiles: TileStore) -> tuple[int, bool] | None:
-        """What to fetch; once cancelled, no more than what one looks at."""
-        eager = self._stopped is None
-        return tiles.next(self.camera.view(), self.state.gpu_memory, eager)
-
-    def _fetch(self, task: Task, document: Document, tiles: TileStore) -> None:
-        """On the worker: one tile after another, until there are no more or another task waits."""
-        from gsasr.rasterize.gl import pack, split_tiles
-
-        try:
-            while self.worker.tasks == [task] and (wanted := self._next_tile(tiles)) is not None:
-                index, shown = wanted
-                what = "Loading" if tiles.holds(index) else "Predicting"
-                task.progress(tiles.share, f"{what} {document.path.name}")
-                gaussians = tiles.gaussians(index)
-                if not tiles.holds(index):
-                    tiles.keep(index, gaussians, self.camera.view())
-                task.check()
-                if shown:
-                    pieces = [pack(piece) for piece in split_tiles(gaussians)]
-                    self.worker.carry_out(task, self._arrive(tiles, index, pieces))
-        except Cancelled:
-            raise
-        except Exception:
-            self.worker.show(None, self._stop)  # else it would begin again at once
-            raise
-
-    def _stop(self) -> None:
-        self._stopped = self.camera.view()
-
-    def _arrive(self, tiles: TileStore, index: int, pieces: list) -> Iterator[None]:
-        """On the window's thread, over several frames: show a tile, and make room for it."""
-        core = tiles.cores[index]
-        if not tiles.any_shown:  # what is there is of an earlier prediction
-            self.scene.clear_tiles()
-            self.painter.invalidate()
-        try:
-            for piece in pieces:
-                self.scene.add_tile(piece)
-                yield
-            tiles.show(index, self.scene.cover(core))
-            self._repaint(core)
-        except BackendError:
-            held = tiles.shown_bytes
-            self.state.gpu_memory = int(ROOM * held)
-            self.fail(
-                f"The GPU has no room for more than {held / 2**20:.0f} MiB of Gaussians; "
-                "what does not fit shows as the source picture."
-            )
-        finally:
-            self.scene.drop_arriving()
-        self._make_room()
-
-    def _make_room(self) -> None:
-        """Take off the GPU what is beyond its budget."""
-        document = self.state.document
-        if document is None or document.tiles is None:
-            return
-        for index in document.tiles.evict(self.camera.view(), self.state.gpu_memory):
-            self.scene.uncover(document.tiles.cores[index])
-            self._repaint(document.tiles.cores[index])
-
-    def _repaint(self, core: Rectangle) -> None:
-        """The Gaussians of a rectangle have come or gone."""
-        view = self.camera.view()
-        left, top = view.to_output(core[0] - REACH, core[1] - REACH)
-        right, bottom = view.to_output(core[2] + REACH, core[3] + REACH)
-        if left < view.size[1] and right > 0:
-            self.painter.invalidate((top, bottom))

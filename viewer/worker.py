@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 
 from gsasr.errors import Cancelled, GsasrError
 
@@ -53,7 +53,7 @@ Work = Callable[[Task], None]
 class Result:
     """What a task hands to the window's thread: steps to go through there."""
 
-    def __init__(self, task: Task | None, steps: Iterator[None]) -> None:
+    def __init__(self, task: Task | None, steps: Generator[None, None, None]) -> None:
         self.task, self.steps = task, steps
         self.done = threading.Event()
 
@@ -84,7 +84,7 @@ class Worker:
         """From the work: have the window's thread call `action`, unless cancelled by then."""
         self._results.put(Result(task, (action() for _ in range(1))))
 
-    def carry_out(self, task: Task, steps: Iterator[None]) -> None:
+    def carry_out(self, task: Task, steps: Generator[None, None, None]) -> None:
         """From the work: have the window's thread go through `steps`, over several frames.
 
         Returns at their end. Raises Cancelled if the task is; the steps are then closed.

@@ -1,0 +1,130 @@
+"""Tiles of Gaussians come and go: what one looks at, then the rest, as long as there is room.
+
+Each frame `follow` sees whether there is something to fetch, and has the worker do it. The worker
+takes one tile after another from the store, which looks at the present view each time; the
+window's thread uploads it, and takes off the GPU what is beyond its budget.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+
+from gsasr.errors import BackendError, Cancelled
+from gsasr.view import View
+
+from .camera import Camera
+from .coverage import REACH
+from .painter import Painter
+from .scene import Scene
+from .state import Document, Rectangle, State
+from .store import TileStore
+from .worker import Task, Worker
+
+ROOM = 0.9  # of what the GPU held when it was full that it may hold from then on
+
+
+class Streaming:
+    """Keeps what the scene draws in step with the view, for one document after another."""
+
+    def __init__(
+        self,
+        state: State,
+        camera: Camera,
+        worker: Worker,
+        scene: Scene,
+        painter: Painter,
+        fail: Callable[[str], None],
+    ) -> None:
+        """fail: tells the user one sentence."""
+        self._state, self._camera, self._worker = state, camera, worker
+        self._scene, self._painter, self._fail = scene, painter, fail
+        self._stopped: View | None = None  # the view at which fetching was stopped
+
+    def restart(self) -> None:
+        """Fetch all there is room for."""
+        self._stopped = None
+
+    def stop(self) -> None:
+        """Fetch nothing until the view moves, and from then on only what it needs."""
+        self._stopped = self._camera.view()
+
+    def follow(self) -> None:
+        """Once per frame: have the worker fetch tiles if there is something for it to do."""
+        document = self._state.document
+        if document is None or document.tiles is None:
+            return
+        view, tiles = self._camera.view(), document.tiles
+        tiles.touch(view)
+        if self._worker.tasks or view == self._stopped or self._next(tiles) is None:
+            return
+        self._worker.post(
+            f"Loading {document.path.name}", lambda task: self._fetch(task, document, tiles)
+        )
+
+    def make_room(self) -> None:
+        """Take off the GPU what is beyond its budget."""
+        document = self._state.document
+        if document is None or document.tiles is None:
+            return
+        tiles = document.tiles
+        for index in tiles.evict(self._camera.view(), self._state.gpu_memory):
+            self._scene.uncover(tiles.cores[index])
+            self._repaint(tiles.cores[index])
+
+    def _next(self, tiles: TileStore) -> tuple[int, bool] | None:
+        eager = self._stopped is None
+        return tiles.next(self._camera.view(), self._state.gpu_memory, eager)
+
+    def _fetch(self, task: Task, document: Document, tiles: TileStore) -> None:
+        """On the worker: one tile after another, until there are no more or another task waits."""
+        from gsasr.rasterize.gl import pack, split_tiles
+
+        try:
+            while self._worker.tasks == [task] and (wanted := self._next(tiles)) is not None:
+                index, shown = wanted
+                held = tiles.holds(index)
+                what = "Loading" if held else "Predicting"
+                task.progress(tiles.share, f"{what} {document.path.name}")
+                gaussians = tiles.gaussians(index)
+                task.check()
+                if not held:
+                    tiles.keep(index, gaussians, self._camera.view())
+                if shown:
+                    pieces = [pack(piece) for piece in split_tiles(gaussians)]
+                    self._worker.carry_out(task, self._arrive(tiles, index, pieces))
+        except Cancelled:
+            raise
+        except Exception:
+            self._worker.show(None, self.stop)  # else it would begin again at once
+            raise
+
+    def _arrive(self, tiles: TileStore, index: int, pieces: list) -> Generator[None, None, None]:
+        """On the window's thread, over several frames: show a tile, and make room for it."""
+        core = tiles.cores[index]
+        if not tiles.any_shown:  # what is there is of an earlier prediction
+            self._scene.clear_tiles()
+            self._painter.invalidate()
+        try:
+            for piece in pieces:
+                self._scene.add_tile(piece)
+                yield
+            tiles.show(index, self._scene.cover(core))
+            self._repaint(core)
+        except BackendError:
+            held = tiles.shown_bytes
+            self._state.gpu_memory = int(ROOM * held)
+            self._fail(
+                f"The GPU has no room for more than {held / 2**20:.0f} MiB of Gaussians; "
+                "what does not fit shows as the source picture."
+            )
+        finally:
+            self._scene.drop_arriving()
+        self.make_room()
+
+    def _repaint(self, core: Rectangle) -> None:
+        """The Gaussians of a rectangle have come or gone."""
+        view = self._camera.view()
+        left, top = view.to_output(core[0] - REACH, core[1] - REACH)
+        right, bottom = view.to_output(core[2] + REACH, core[3] + REACH)
+        if left < view.size[1] and right > 0:
+            self._painter.invalidate((top, bottom))

@@ -7,10 +7,13 @@ import os
 import platform
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from .errors import BackendError
 from .processor import cores
-from .rasterize.driver import VideoMemory
+
+if TYPE_CHECKING:
+    from .rasterize.driver import VideoMemory
 
 # What the rasterizer minds: name in OpenGL -> what it is called here, unit
 GL_LIMITS = {

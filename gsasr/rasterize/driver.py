@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import moderngl
 
 from ..memory import available
+from .opengl import create_context, software
 
 NVX_DEDICATED, NVX_FREE = 0x9047, 0x9049  # GL_NVX_gpu_memory_info, KiB
 ATI_FREE = 0x87FB  # GL_ATI_meminfo, for buffers: four numbers, the first is what is free, KiB
@@ -42,8 +43,6 @@ def video_memory(ctx: moderngl.Context) -> VideoMemory:
         free = _kibibytes(ctx, ATI_FREE)
     if free is not None:
         return VideoMemory(total, free, max(LEAST, int(SHARE * free)))
-    from .gl import software  # only here, as it loads numba
-
     if software(ctx.info):
         return VideoMemory(None, None, max(LEAST, int(SOFTWARE_SHARE * available())))
     return VideoMemory(None, None, UNKNOWN)
@@ -51,7 +50,6 @@ def video_memory(ctx: moderngl.Context) -> VideoMemory:
 
 def headless_memory() -> VideoMemory:
     """The same of a context of its own. Raises BackendError where there is none."""
-    from .gl import create_context
 
     def ask() -> VideoMemory:
         ctx = create_context()

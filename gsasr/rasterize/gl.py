@@ -347,10 +347,11 @@ def _render(gaussians: Gaussians, view: View, quality: str) -> np.ndarray:
     image = np.zeros((*view.size, 3), np.float32)
     if image.size == 0 or len(gaussians) == 0:
         return image
+    sides = (blocks.side_for(view),)  # the only view of these tiles
     held: list[GlTile] = []
     try:
         for part in split_tiles(visible(gaussians, view, quality)):
-            held.append(rasterizer.upload(pack(part, quality)))
+            held.append(rasterizer.upload(pack(part, quality, sides)))
             if sum(tile.nbytes for tile in held) > HELD:
                 _add(rasterizer, held, view, image)
         _add(rasterizer, held, view, image)

@@ -24,7 +24,7 @@ BUDGET = 0.008  # seconds of drawing per frame: leaves half of a frame at 60 Hz 
 SOFTWARE_BUDGET = 0.016
 REST = 0.05  # seconds without a change of view after which the picture is made exact
 REDUCTIONS = (1, 2, 3, 4, 6, 8)
-MIN_ROWS = 8  # of a slice
+MIN_ROWS = 4  # of a slice
 LEAST = 0.25  # of the budget that drawing has even if other work has used up the frame
 NOTHING = Overlay()
 # First guesses for a small GPU: seconds per pixel at 1:1 of the Gaussians and of what shows them

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
+import socket
 import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 # First: it chooses the GLFW library that glfw, below, has to share with it.
 from imgui_bundle import hello_imgui  # isort: skip
@@ -140,9 +144,29 @@ def run(
         params.use_imgui_test_engine = True
         params.callbacks.register_tests = lambda: tests(app)
     try:
-        hello_imgui.run(params)
+        with _waking_on_signals():
+            hello_imgui.run(params)
     finally:
         session.worker.stop()
+
+
+@contextmanager
+def _waking_on_signals() -> Iterator[None]:
+    """Let Ctrl+C in the terminal end a window that waits for events, in which no Python runs."""
+    read, write = socket.socketpair()
+    write.setblocking(False)
+
+    def wake() -> None:
+        while read.recv(1):
+            hello_imgui.request_refresh()
+
+    threading.Thread(target=wake, name="signals", daemon=True).start()
+    before = signal.set_wakeup_fd(write.fileno())
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        write.close()  # which ends the thread
 
 
 def require_window() -> None:

@@ -22,6 +22,7 @@ from .scene import Overlay, Scene, Target
 BUDGET = 0.008  # seconds of drawing per frame: leaves half of a frame at 60 Hz to all the rest
 # Where the CPU draws, there is nothing beside it to wait for, and 30 frames a second have to do.
 SOFTWARE_BUDGET = 0.016
+PATIENCE = 1.75  # times the budget for a frame at rest, when nothing on the screen moves
 REST = 0.05  # seconds without a change of view after which the picture is made exact
 REDUCTIONS = (1, 2, 3, 4, 6, 8)
 MIN_ROWS = 4  # of a slice
@@ -112,7 +113,7 @@ class Painter:
             self._shown = view, overlay
             self.invalidate()
         if self.busy and now - self._changed > REST:
-            self._sharpen(view, overlay, budget)
+            self._refine(view, overlay, PATIENCE * budget)
             return True
         return False
 
@@ -136,6 +137,13 @@ class Painter:
             self._small.texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
         self._draw(self._small, small, overlay, (0, small.size[0]), share)
         self._drawn, self._stale = 0, (0, 0)
+
+    def _refine(self, view: View, overlay: Overlay, budget: float) -> None:
+        """A slice; more of them if the budget allows, which is known at once of software only."""
+        left, deadline = budget, time.perf_counter() + budget
+        while self.busy and left > budget / 3:
+            self._sharpen(view, overlay, left)
+            left = deadline - time.perf_counter() if self._clock.software else 0.0
 
     def _sharpen(self, view: View, overlay: Overlay, budget: float) -> None:
         """Some more rows, exactly: first those never drawn, then those out of date."""

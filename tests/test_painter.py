@@ -84,9 +84,12 @@ def test_in_motion_gaussians_are_drawn_as_small_as_the_budget_demands(scene):
     for rate, seconds in zip(rates, (1e-6, 1e-8), strict=True):
         rate.learn = lambda *_: None
         rate.predict = lambda scale, seconds=seconds: seconds
+    work = scene.work(LAST).sum()
     # Smaller still, Gaussians would be coarser than the source, which is drawn instead.
     for reduction, share in ((1, 1.0), (3, 1.0), (8, 1.0), (2, 0.0), (8, 0.0)):
-        painter.budget = 1.001 * painter._seconds(reduced(LAST, reduction), share).sum()
+        area = reduction**2
+        seconds = painter._seconds(10 / reduction, 300 * 400 / area, share * work / area)
+        painter.budget = 1.001 * seconds
         painter.reset()
         painter.paint(LAST, Overlay())
         assert painter.reduction == reduction

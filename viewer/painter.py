@@ -152,8 +152,10 @@ class Painter:
             return
         height = view.size[0]
         start, stop = (self._drawn, height) if self._drawn < height else self._stale
-        share = self._scene.share(min(view.scale))
-        seconds = np.cumsum(self._seconds(view, share)[start:stop])
+        scale = min(view.scale)
+        share = self._scene.share(scale)
+        covered = self._covered(view, share)[start:stop]
+        seconds = np.cumsum(self._seconds(scale, view.size[1], covered))
         affordable = int(np.searchsorted(seconds, budget))
         stop = min(stop, start + max(MIN_ROWS, affordable))
         self._draw(self.target, view, overlay, (start, stop), share)
@@ -169,25 +171,28 @@ class Painter:
 
         Gaussians at least as finely as the picture has pixels; if that takes too long, the source.
         """
-        share = self._scene.share(min(view.scale))
-        for reduction in REDUCTIONS if share > 0 else ():
-            small = _reduced(view, reduction)
-            if min(small.scale) < 1:
-                break
-            if self._seconds(small, share).sum() <= budget:
-                return reduction, share
-        for reduction in REDUCTIONS:
-            if self._seconds(_reduced(view, reduction), 0.0).sum() <= budget:
-                return reduction, 0.0
+        scale = min(view.scale)
+        share = self._scene.share(scale)
+        pixels, covered = view.size[0] * view.size[1], self._covered(view, share).sum()
+        for shown in (share, 0.0):
+            for reduction in REDUCTIONS:
+                if shown > 0 and scale / reduction < 1:
+                    break
+                area = reduction**2
+                work = pixels / area, covered / area if shown > 0 else 0.0
+                if self._seconds(scale / reduction, *work) <= budget:
+                    return reduction, shown
         return REDUCTIONS[-1], 0.0
 
-    def _seconds(self, view: View, share: float) -> np.ndarray:
-        """(h,) what the rows of a view are expected to take."""
-        scale = min(view.scale)
-        seconds = np.full(view.size[0], view.size[1] * self._passes.predict(scale))
-        if share > 0:
-            seconds += self._scene.work(view) * self._gaussians.predict(scale)
-        return seconds
+    def _covered(self, view: View, share: float) -> np.ndarray:
+        """(h,) pixels of each row that Gaussians are drawn on."""
+        return self._scene.work(view) if share > 0 else np.zeros(view.size[0])
+
+    def _seconds(
+        self, scale: float, pixels: float, covered: float | np.ndarray
+    ) -> float | np.ndarray:
+        """What so many pixels are expected to take, so many of them covered by Gaussians."""
+        return pixels * self._passes.predict(scale) + covered * self._gaussians.predict(scale)
 
     def _draw(
         self, target: Target, view: View, overlay: Overlay, rows: tuple[int, int], share: float
@@ -196,15 +201,16 @@ class Painter:
             self._mark(view, overlay)
         scale = min(view.scale)
         pixels = (rows[1] - rows[0]) * view.size[1]
-        covered = self._scene.work(view)[slice(*rows)].sum() if share > 0 else 0.0
+        covered = self._covered(view, share)[slice(*rows)].sum()
 
         def learn(seconds: float) -> None:
+            """What took the most is held to be what was misjudged."""
             self.seconds = seconds
-            if covered:
-                seconds = max(0.0, seconds - pixels * self._passes.predict(scale))
-                self._gaussians.learn(scale, seconds / covered)
-            else:
-                self._passes.learn(scale, seconds / pixels)
+            ratio = seconds / self._seconds(scale, pixels, covered)
+            most = self._gaussians
+            if covered * most.predict(scale) < pixels * self._passes.predict(scale):
+                most = self._passes
+            most.learn(scale, ratio * most.predict(scale))
 
         with self._clock.measure(learn):
             self._scene.draw(target, view, overlay, rows, share)

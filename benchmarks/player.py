@@ -93,6 +93,7 @@ def send(worker: Worker, scene: Scene, painter: Painter, field: Gaussians) -> Ta
         painter.invalidate()
 
     def work(task: Task) -> None:
+        worker.show(task, scene.prepare)
         for part, core in split(field):
             for piece in gl.split_tiles(part):
                 task.check()

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from viewer_scenarios import assert_shows, make_field
 
+from gsasr.rasterize.gl import pack
 from viewer.mipmaps import mipmaps
 from viewer.painter import Painter
 from viewer.scene import Overlay, Scene
@@ -27,6 +28,15 @@ SOURCE, CANVAS, SECONDS, FPS = (120, 200), (180, 240), 4.0, 60.0
 def scene(gl_context):
     made = Scene(gl_context)
     made.show_picture(mipmaps(np.full((*SOURCE, 4), 255, np.uint8)))
+    # Drivers compile when something is first drawn, which is not what is tested here.
+    made.add_tile(pack(make_field((2, 2))))
+    while made.loading:
+        made.load(1.0)
+    for covered in (False, True):
+        if covered:
+            made.cover((0, 0, SOURCE[1], SOURCE[0]))
+        play(Painter(made), zoom_and_pan(SOURCE, CANVAS, 0.5, FPS), FPS)
+    made.clear_tiles()
     yield made
     made.release()
 
@@ -55,7 +65,7 @@ def test_the_path_is_smooth_while_gaussians_arrive_and_sharp_at_rest(scene):
     frames = play(painter, views, FPS, deliver(worker, scene, painter), patience=60.0)
     worker.stop()
     assert task not in worker.tasks and scene.covers(views[-1])  # all has arrived on the way
-    assert max(frame.seconds for frame in frames[1:]) < 0.25  # the first one compiles shaders
+    assert max(frame.seconds for frame in frames) < 0.25
     assert any(frame.reduction > 1 for frame in frames)
     assert all(frame.moved or not frame.sharp for frame in frames if frame.reduction > 1)
     assert frames[-1].sharp and frames[-1].reduction == 1

@@ -8,6 +8,7 @@ where Gaussians have not arrived yet.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -68,6 +69,7 @@ class Scene:
         self.tiles: list = []
         self.overlay_drawn = True  # False where Gaussians lie too close together on the screen
         self._rasterizer = None  # both need torch, which is not imported before the first tile
+        self._warming: Iterator[None] | None = None  # programs still to be compiled
         self._overlays = None
         self._source: Source | None = None
         self._coverage: Coverage | None = None
@@ -91,12 +93,27 @@ class Scene:
 
     @property
     def loading(self) -> bool:
-        """Is there something of the picture left to upload?"""
-        return self._source is not None and self._source.loading
+        """Is there something left to upload or to compile?"""
+        return (self._source is not None and self._source.loading) or self._warming is not None
 
     def load(self, seconds: float) -> bool:
-        """Upload more of the picture for about so long; True if it can be shown finer now."""
-        return self._source is not None and self._source.load(seconds)
+        """Upload more of the picture for about so long; True if it can be shown finer now.
+
+        Once all of it is there, compile a program of those that draw Gaussians (see prepare).
+        """
+        if self._source is not None and self._source.loading:
+            return self._source.load(seconds)
+        if self._warming is not None and next(self._warming, "done") == "done":
+            self._warming = None
+        return False
+
+    def prepare(self) -> None:
+        """Tiles of Gaussians will come: be ready to draw them, by and by, as `load` is called."""
+        if self._rasterizer is None:
+            from gsasr.rasterize.gl import GlRasterizer
+
+            self._rasterizer = GlRasterizer(self.ctx)
+            self._warming = self._rasterizer.warming()
 
     def clear(self) -> None:
         """Forget picture and tiles."""
@@ -117,11 +134,7 @@ class Scene:
 
     def add_tile(self, packed: PackedTile) -> None:
         """Add Gaussians; nothing of them shows before `cover`. Raises BackendError: no memory."""
-        if self._rasterizer is None:
-            from gsasr.rasterize.gl import GlRasterizer
-
-            self._rasterizer = GlRasterizer(self.ctx)
-            self._rasterizer.warm_up()
+        self.prepare()
         self.tiles.append(self._rasterizer.upload(packed))
 
     def cover(self, core: Rectangle) -> None:

@@ -217,6 +217,7 @@ class Session:
         """On the worker: pack each tile and hand it to the window."""
         from gsasr.rasterize.gl import pack, split_tiles
 
+        self.worker.show(task, self.scene.prepare)
         for part, core in tiles:
             for piece in split_tiles(part):
                 task.check()

@@ -13,6 +13,7 @@ from gsasr.view import View
 from . import export, loading
 from .camera import Camera
 from .coverage import REACH
+from .mipmaps import Mipmaps, mipmaps
 from .painter import Painter
 from .scene import Overlay, Scene
 from .state import CONDITION, OVERLAYS, SIGMA, Document, Message, Rectangle, State
@@ -54,7 +55,8 @@ class Session:
 
         def work(task: Task) -> None:
             document, tiles = self._loader.open(task, path)
-            self.worker.show(task, lambda: self._show(document))
+            levels = mipmaps(document.pixels)
+            self.worker.show(task, lambda: self._show(document, levels))
             if document.picture is not None:
                 tiles = self._loader.predict(task, document, model, condition, self._center)
             self._arrive(task, document, tiles)
@@ -204,10 +206,10 @@ class Session:
         view = self.camera.view()
         return view.to_source(view.size[1] / 2, view.size[0] / 2)
 
-    def _show(self, document: Document) -> None:
+    def _show(self, document: Document, levels: Mipmaps) -> None:
         self.state.document = document
         self.state.message = None
-        self.scene.set_picture(document.pixels)
+        self.scene.show_picture(levels)
         self.camera.set_picture(document.size)
         self.painter.reset()
 
@@ -215,6 +217,7 @@ class Session:
         """On the worker: pack each tile and hand it to the window."""
         from gsasr.rasterize.gl import pack, split_tiles
 
+        self.worker.show(task, self.scene.prepare)
         for part, core in tiles:
             for piece in split_tiles(part):
                 task.check()

@@ -55,6 +55,7 @@ class Worker:
 
     def __init__(self, on_error: Callable[[str], None]) -> None:
         """on_error: called on the window's thread with one sentence."""
+        self.wake: Callable[[], None] = lambda: None  # called when the window has to look again
         self._on_error = on_error
         self._results: queue.SimpleQueue[tuple[Task | None, Action]] = queue.SimpleQueue()
         self._tasks: list[Task] = []  # running and waiting, oldest first
@@ -74,6 +75,7 @@ class Worker:
     def show(self, task: Task, action: Action) -> None:
         """From the work: have the window's thread call `action`, unless cancelled by then."""
         self._results.put((task, action))
+        self.wake()
 
     @property
     def tasks(self) -> list[Task]:
@@ -130,6 +132,7 @@ class Worker:
             finally:
                 with self._lock:
                     self._tasks.remove(task)
+                self.wake()
 
     def _fail(self, sentence: str) -> None:
-        self._results.put((None, lambda: self._on_error(sentence)))
+        self._results.put((None, lambda: self._on_error(sentence)))  # and `_run` wakes

@@ -2,17 +2,22 @@
 // The picture as the window shows it: the source below 1:1, the Gaussians above, a blend between,
 // the source again where Gaussians have not arrived, and nothing outside of the picture.
 //
-// WITH_SOURCE, WITH_FIELD, WITH_OVERLAY: what is needed. MAGNIFIED: more than 1:1.
+// WITH_SOURCE, WITH_FIELD, WITH_OVERLAY: what is needed. MAGNIFIED: more than 1:1, and `source` is
+// the picture itself.
 
-layout(binding = 0) uniform sampler2D source;  // RGBA, sRGB-encoded, mip-mapped, not premultiplied
+layout(binding = 0) uniform sampler2D source;  // a mip level: RGBA, sRGB-encoded, not premultiplied
 layout(binding = 1) uniform sampler2D field;  // sum of Gaussians for this view
 layout(binding = 2) uniform sampler2D coverage;  // 1 where all Gaussians have arrived
 layout(binding = 3) uniform sampler2D overlay;  // RGBA of this view, premultiplied
+layout(binding = 4) uniform sampler2D coarser;  // the next mip level
 
 uniform ivec2 base;  // the view's origin is base + fraction, source pixels: exact at any zoom
 uniform vec2 fraction;
 uniform vec2 pixel;  // source pixels per output pixel
 uniform ivec2 size;  // of the picture, source pixels
+uniform vec2 span;  // source pixels that `source` covers
+uniform vec2 coarser_span;
+uniform float blend;  // share of the coarser level
 uniform float share;  // of the Gaussians, in [0, 1]; the rest is the source
 uniform vec2 covered;  // source pixels that the coverage texture spans
 uniform bool has_alpha;
@@ -43,9 +48,10 @@ vec4 from_source(ivec2 at, vec2 inside)
 #else
 vec4 from_source(ivec2 at, vec2 inside)
 {
-    vec2 whole = vec2(size);
-    return textureGrad(
-        source, (vec2(at) + inside) / whole, vec2(pixel.x / whole.x, 0.0), vec2(0.0, pixel.y / whole.y));
+    vec2 position = vec2(at) + inside;
+    vec4 color = texture(source, position / span);
+    if (blend > 0.0) color = mix(color, texture(coarser, position / coarser_span), blend);
+    return color;
 }
 #endif
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from viewer_scenarios import assert_shows, make_field
@@ -10,8 +13,9 @@ from gsasr.rasterize.gl import pack, split_tiles
 from gsasr.view import View
 from viewer.coverage import BLOCK, EDGE
 from viewer.loading import split, to_rgba
-from viewer.painter import Painter
+from viewer.mipmaps import mipmaps
 from viewer.scene import BACKGROUND, Overlay, Scene, Target
+from viewer.source import Source
 
 STEP = 1 / 255
 
@@ -156,7 +160,7 @@ def test_a_reduced_view_shows_the_same_share_of_gaussians(scene):
     scene.set_picture(pixels)
     add(scene, field)
     reduced = View((0, 0), (0.75, 0.75), (22, 30))
-    assert_shows(show(scene, reduced, zoom=3.0).astype(np.float32), field, reduced, step=1)
+    assert_shows(show(scene, reduced, share=1.0).astype(np.float32), field, reduced, step=1)
 
 
 def test_transparent_pixels_show_a_checkerboard(scene):
@@ -182,56 +186,47 @@ def test_color_under_the_cursor_is_that_of_the_pixel(scene):
     assert scene.color_at(view, 1, 1) is None
 
 
-def test_painter_sharpens_when_the_view_rests(scene, monkeypatch):
-    import viewer.painter as module
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (64, 64), (301, 222)])
+def test_mip_levels_are_means_down_to_one_pixel(size):
+    pixels = np.random.default_rng(0).integers(0, 256, (*size, 4), dtype=np.uint8)
+    made = mipmaps(pixels)
+    assert np.array_equal(made.levels[0], pixels)
+    assert made.has_alpha
+    assert made.levels[-1].shape == (1, 1, 4)
+    for fine, coarse in zip(made.levels, made.levels[1:], strict=False):
+        for y, x in {(0, 0), (len(coarse) - 1, coarse.shape[1] - 1)}:
+            expected = fine[2 * y : 2 * y + 2, 2 * x : 2 * x + 2].reshape(-1, 4).mean(0)
+            assert np.abs(coarse[y, x] - expected).max() <= 0.5
 
-    field = make_field()
-    scene.set_picture(random_picture())
-    add(scene, field)
-    painter = Painter(scene)
-    monkeypatch.setattr(module, "BUDGET", 1e-5)  # a machine on which nothing is affordable
-    view = View((-3, -2), (10.0, 10.0), (300, 400))
-    assert painter.paint(view, Overlay())
-    for step in range(1, 6):
-        view = View((-3 + step, -2), (10.0, 10.0), (300, 400))
-        assert painter.paint(view, Overlay())
-        assert painter.reduction > 1 and painter.busy
-        (layer, exact) = painter.layers()
-        assert exact.y1 == 0
-        small = painter._small.read() / 255
-        view_of_it = View(
-            view.origin, tuple(s / painter.reduction for s in view.scale), small.shape[:2]
-        )
-        assert_shows(small.astype(np.float32), field, view_of_it)
-        assert layer.u1 * small.shape[1] * painter.reduction == pytest.approx(400)
-    assert not painter.paint(view, Overlay())  # nothing changed, and it has not rested yet
-    painter._changed -= 1.0
-    monkeypatch.setattr(module, "BUDGET", 1e-4)
-    count = 0
-    while painter.busy:
-        assert painter.paint(view, Overlay())
+
+def test_a_large_picture_is_shown_coarsely_at_once_and_exactly_in_the_end(scene):
+    ramp = np.zeros((900, 1100, 4), np.uint8)
+    ramp[..., 0] = np.linspace(0, 255, 1100)[None]
+    ramp[..., 1] = np.linspace(0, 255, 900)[:, None]
+    ramp[..., 3] = 255
+    scene.show_picture(mipmaps(ramp))
+    view = View((0, 0), (1.0, 1.0), (900, 1100))
+    assert scene.loading
+    assert np.abs(show(scene, view) - ramp[..., :3] / 255).max() <= 4 * STEP
+    count = 1
+    while not scene.load(0.0):
         count += 1
-    assert count > 1  # not all at once
-    assert painter.reduction == 1
-    assert_shows((painter.target.read() / 255).astype(np.float32), field, view)
-    assert not painter.paint(view, Overlay())
+    assert count > 1  # in bands
+    assert not scene.loading
+    assert np.array_equal(show(scene, view), ramp[..., :3] / 255)
 
 
-def test_painter_draws_again_only_what_arrived(scene):
-    scene.set_picture(random_picture())
-    painter = Painter(scene)
-    view = View((0, 0), (10.0, 10.0), (300, 400))
-    painter.paint(view, Overlay())
-    assert not painter.busy
-    painter.invalidate((-50, -10))
-    assert not painter.busy
-    field = make_field()
-    add(scene, field)
-    painter.invalidate((-50, 1000))
-    assert painter.busy
-    while painter.busy:
-        painter.paint(view, Overlay())
-    assert_shows((painter.target.read() / 255).astype(np.float32), field, view)
+def test_a_picture_beyond_the_largest_texture_is_averaged(gl_context):
+    small = SimpleNamespace(info={"GL_MAX_TEXTURE_SIZE": 100}, texture=gl_context.texture)
+    pixels = random_picture((150, 180))
+    source = Source(small, mipmaps(pixels))
+    source.load(math.inf)
+    finer, _, share = source.levels(1.0)
+    assert finer.texture.size == (90, 75) and finer.span == (180, 150) and share == 0
+    drawn = np.frombuffer(finer.texture.read(), np.uint8).reshape(75, 90, 4)
+    expected = pixels.reshape(75, 2, 90, 2, 4).mean((1, 3))
+    assert np.abs(drawn - expected).max() <= 0.5
+    source.release()
 
 
 def test_bytes_of_a_picture_are_kept():

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
+import socket
 import sys
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 # First: it chooses the GLFW library that glfw, below, has to share with it.
 from imgui_bundle import hello_imgui  # isort: skip
@@ -24,8 +29,10 @@ from .scene import Scene
 from .session import Session
 
 TITLE = "GSASR"
-BUSY_FPS, IDLE_FPS = 10.0, 1.0  # without input; input is handled at once in any case
-RESULTS = 0.006  # seconds per frame for what the worker has sent
+# Frames per second without input, which is handled at once in any case, as are results of the
+# worker. Hello ImGui waits for so long; 0 would mean that it does not wait at all.
+BUSY_FPS, IDLE_FPS = 10.0, 0.001
+RESULTS = 0.006  # seconds per frame for what the worker has sent, and for uploading the picture
 LOST = (
     "The graphics driver was reset, and all that was on the GPU is gone; "
     "nothing unsaved is lost, so open the picture again."
@@ -58,6 +65,7 @@ class App:
         ctx = moderngl.create_context(require=430)
         self.session.start(Scene(ctx))
         window = glfw_window_hello_imgui()
+        self.session.worker.wake = hello_imgui.request_refresh
         glfw.set_drop_callback(window, lambda _, paths: self.drop(paths))
 
     def drop(self, paths: list[str]) -> None:
@@ -69,15 +77,21 @@ class App:
     def frame(self) -> None:
         """One frame."""
         session = self.session
+        start = time.perf_counter()
         if self.lost or lost(session.scene.ctx):
             self.lost = True  # there is nothing left to draw with, not even a message
             hello_imgui.get_runner_params().app_shall_exit = True
             return
         if session.worker.deliver(RESULTS):
             hello_imgui.request_refresh()
+        if session.scene.loading:
+            hello_imgui.request_refresh()
+            if session.scene.load(start + RESULTS - time.perf_counter()):
+                session.painter.invalidate()
+        spent = time.perf_counter() - start
         menu.handle_keys(session)
         menu.draw(session)
-        canvas.draw(session, status.height())
+        canvas.draw(session, status.height(), spent)
         overlay_panel.draw(session)
         status.draw(session)
         for name in sorted(session.state.dialogs):
@@ -151,7 +165,8 @@ def run(
         params.use_imgui_test_engine = True
         params.callbacks.register_tests = lambda: tests(app)
     try:
-        hello_imgui.run(params)
+        with _waking_on_signals():
+            hello_imgui.run(params)
     finally:
         session.worker.stop()
     if app.lost:
@@ -163,6 +178,25 @@ def _tell(sentence: str) -> str:
     if has_native():
         native.message(TITLE, sentence, native.choice.ok, native.icon.error).result()
     return sentence
+
+
+@contextmanager
+def _waking_on_signals() -> Iterator[None]:
+    """Let Ctrl+C in the terminal end a window that waits for events, in which no Python runs."""
+    read, write = socket.socketpair()
+    write.setblocking(False)
+
+    def wake() -> None:
+        while read.recv(1):
+            hello_imgui.request_refresh()
+
+    threading.Thread(target=wake, name="signals", daemon=True).start()
+    before = signal.set_wakeup_fd(write.fileno())
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        write.close()  # which ends the thread
 
 
 def require_window() -> None:

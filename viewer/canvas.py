@@ -19,8 +19,11 @@ _FLAGS = (
 )
 
 
-def draw(session: Session, bottom: float) -> None:
-    """Fill the work area above a strip of height `bottom` with the picture."""
+def draw(session: Session, bottom: float, spent: float) -> None:
+    """Fill the work area above a strip of height `bottom` with the picture.
+
+    spent: seconds of this frame that other work has taken already.
+    """
     viewport = imgui.get_main_viewport()
     size = imgui.ImVec2(viewport.work_size.x, max(1.0, viewport.work_size.y - bottom))
     imgui.set_next_window_pos(viewport.work_pos)
@@ -38,7 +41,7 @@ def draw(session: Session, bottom: float) -> None:
     imgui.invisible_button("picture", size)
     _mouse(session, corner, density.x)
     session.camera.tick(io.delta_time)
-    if session.painter.paint(session.camera.view(), session.overlay()):
+    if session.painter.paint(session.camera.view(), session.overlay(), spent):
         session.state.frame_seconds = session.painter.seconds
         session.state.color = None
     _read_color(session)
@@ -82,9 +85,13 @@ def _mouse(session: Session, corner: imgui.ImVec2, density: float) -> None:
 
 
 def _read_color(session: Session) -> None:
-    """The colour under the cursor, once per change of cursor or picture, and not in motion."""
+    """The colour under the cursor, once per change of cursor or picture.
+
+    Reading waits for the GPU, so not while there is something to draw.
+    """
     state = session.state
-    if state.cursor is not None and state.color is None and not session.camera.moving:
+    busy = session.camera.moving or session.painter.busy
+    if state.cursor is not None and state.color is None and not busy:
         x, y = (int(value) for value in state.cursor)
         state.color = session.scene.color_at(session.camera.view(), x, y)
 

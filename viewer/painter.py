@@ -11,17 +11,26 @@ import time
 from dataclasses import dataclass
 
 import moderngl
+import numpy as np
 
 from gsasr.view import View
 
+from .clock import Clock
+from .rates import Rates
 from .scene import Overlay, Scene, Target
 
-BUDGET = 0.014  # seconds of drawing per frame while the view moves
-PATIENCE = 2.0  # as much of it per frame at rest, when nobody waits for the next one
-REST = 0.1  # seconds without a change of view after which the picture is made exact
+BUDGET = 0.008  # seconds of drawing per frame: leaves half of a frame at 60 Hz to all the rest
+# Where the CPU draws, there is nothing beside it to wait for, and 30 frames a second have to do.
+SOFTWARE_BUDGET = 0.016
+PATIENCE = 1.75  # times the budget for a frame at rest, when nothing on the screen moves
+REST = 0.05  # seconds without a change of view after which the picture is made exact
 REDUCTIONS = (1, 2, 3, 4, 6, 8)
-MIN_ROWS = 16
+MIN_ROWS = 4  # of a slice
+LEAST = 0.25  # of the budget that drawing has even if other work has used up the frame
 NOTHING = Overlay()
+# First guesses for a small GPU: seconds per pixel at 1:1 of the Gaussians and of what shows them
+GAUSSIANS, PASS = 4e-8, 1e-9
+SLOWER = 30  # times, where the CPU draws
 
 
 @dataclass(frozen=True)
@@ -40,117 +49,178 @@ class Painter:
     """Draws a scene for a canvas."""
 
     def __init__(self, scene: Scene) -> None:
-        self.target: Target | None = None  # exact where it is not to be done yet
-        self.seconds = 0.0  # that the last drawing took
-        self.reduction = 1  # canvas pixels per drawn pixel of what is not exact
+        self.target: Target | None = None  # rows [0, self._drawn) show the present view
+        self.seconds = 0.0  # that the last drawing measured took
+        self.reduction = 1  # canvas pixels per drawn pixel of the rows below
         self._scene = scene
+        self._clock = Clock(scene.ctx)
+        self.budget = SOFTWARE_BUDGET if self._clock.software else BUDGET
         self._small: Target | None = None
         self._shown: tuple[View, Overlay] | None = None
-        self._todo = (0, 0)  # rows of the target that are not exact yet
+        self._drawn = 0
+        self._stale = (0, 0)  # of the drawn rows, those that are not exact or out of date
         self._changed = -math.inf  # when the view did
-        # Learned: seconds per pixel, without and with Gaussians, and per overlay
-        self._rate = {False: Average(5e-9), True: Average(3e-8)}
-        self._marks = Average(0.0)
+        slower = SLOWER if self._clock.software else 1
+        self._gaussians = Rates(GAUSSIANS * slower)  # per pixel and tile that lies there
+        self._passes = Rates(PASS * slower)  # per pixel of the pass that puts all together
+        self._marks = 0.0  # seconds that the overlay took
 
     def invalidate(self, rows: tuple[float, float] = (-math.inf, math.inf)) -> None:
         """Draw these output rows of the present view again: what they show has changed."""
-        if self._shown is None:
-            return
-        height = self._shown[0].size[0]
-        start, stop = max(0, rows[0]), min(height, rows[1])
+        start, stop = math.floor(max(rows[0], 0)), math.ceil(min(rows[1], self._drawn))
         if start < stop:
-            first, last = self._todo if self.busy else (height, 0)
-            self._todo = min(first, math.floor(start)), max(last, math.ceil(stop))
+            first, last = self._stale if self._stale[0] < self._stale[1] else (start, stop)
+            self._stale = min(first, start), max(last, stop)
 
     def reset(self) -> None:
         """Forget what is on screen: the document is another one."""
-        self._shown = None
+        self._shown, self._drawn, self._stale = None, 0, (0, 0)
 
     @property
     def busy(self) -> bool:
         """Is there something left to draw?"""
-        return self._todo[0] < self._todo[1]
+        unfinished = self._shown is not None and self._drawn < self._shown[0].size[0]
+        return unfinished or self._stale[0] < self._stale[1]
 
     def layers(self) -> list[Layer]:
         """What to show, the lowest first."""
         height, width = self.target.size
-        if self.reduction == 1:
-            return [Layer(self.target.texture, 0, height, 1, 0, 1)]
+        exact = Layer(self.target.texture, 0, self._drawn, 1, 0, self._drawn / height)
+        if self._drawn == height:
+            return [exact]
         rows, columns = (side * self.reduction for side in self._small.size)
         small = Layer(self._small.texture, 0, height, width / columns, 0, height / rows)
-        done = self._todo[0]
-        return [small, Layer(self.target.texture, 0, done, 1, 0, done / height)]
+        return [small, exact]
 
-    def paint(self, view: View, overlay: Overlay) -> bool:
-        """Bring what is shown closer to the view, within the budget; True if it changed."""
+    def paint(self, view: View, overlay: Overlay, spent: float = 0.0) -> bool:
+        """Bring what is shown closer to the view, within the budget; True if it changed.
+
+        spent: seconds of this frame that other work has taken already.
+        """
+        self._clock.tick()
         now = time.perf_counter()
+        budget = max(self.budget - spent, LEAST * self.budget)
         if self.target is None or self.target.size != view.size:
             self.target = self._resized(self.target, view.size)
-            self._shown = None
-        if self._shown != (view, overlay):
-            if self._shown is not None and self._shown[0] != view:
+            self.reset()
+        if self._shown is None or self._shown[0] != view:
+            if self._shown is not None:
                 self._changed = now
             self._shown = view, overlay
-            self._draw_all(view, overlay, moving=now - self._changed < REST)
+            self._draw_all(view, overlay, budget)
             return True
+        if self._shown[1] != overlay:
+            self._shown = view, overlay
+            self.invalidate()
         if self.busy and now - self._changed > REST:
-            self._sharpen(view, overlay)
+            self._refine(view, overlay, PATIENCE * budget)
             return True
         return False
 
-    def _draw_all(self, view: View, overlay: Overlay, moving: bool) -> None:
+    def _draw_all(self, view: View, overlay: Overlay, budget: float) -> None:
         """The whole view at once, as well as the budget allows."""
-        # An overlay that takes longer than a frame comes when the view rests.
-        if moving and self._marks.value > BUDGET:
+        wanted = self._scene.share(min(view.scale)), overlay
+        # An overlay that takes too long comes when the view rests.
+        if overlay != NOTHING and self._marks > budget / 2:
             overlay = NOTHING
-        self.reduction = self._affordable(view, overlay)
+        marks = self._marks if overlay != NOTHING else 0.0
+        self.reduction, share = self._affordable(view, budget - marks)
+        rows = view.size[0]
         if self.reduction == 1:
-            self._draw(self.target, view, overlay, (0, view.size[0]))
-        else:
-            size = tuple(-(-side // self.reduction) for side in view.size)
-            scale = tuple(side / self.reduction for side in view.scale)
-            if self._small is None or self._small.size != size:
-                self._small = self._resized(self._small, size)
-                self._small.texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
-            small = View(view.origin, scale, size)
-            self._draw(self._small, small, overlay, (0, size[0]), min(view.scale))
-        exact = self.reduction == 1 and overlay == self._shown[1]
-        self._todo = (0, 0) if exact else (0, view.size[0])
+            self._draw(self.target, view, overlay, (0, rows), share)
+            exact = (share, overlay) == wanted
+            self._drawn, self._stale = rows, (0, 0) if exact else (0, rows)
+            return
+        small = _reduced(view, self.reduction)
+        if self._small is None or self._small.size != small.size:
+            self._small = self._resized(self._small, small.size)
+            self._small.texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
+        self._draw(self._small, small, overlay, (0, small.size[0]), share)
+        self._drawn, self._stale = 0, (0, 0)
 
-    def _sharpen(self, view: View, overlay: Overlay) -> None:
-        """Some more rows, exactly."""
-        start, stop = self._todo
-        rate = self._rate[self._scene.share(min(view.scale)) > 0].value
-        end = min(stop, start + max(MIN_ROWS, int(PATIENCE * BUDGET / (rate * view.size[1]))))
-        self._draw(self.target, view, overlay, (start, end))
-        self._todo = (end, stop) if end < stop else (0, 0)
-        if not self.busy:
+    def _refine(self, view: View, overlay: Overlay, budget: float) -> None:
+        """A slice; more of them if the budget allows, which is known at once of software only."""
+        left, deadline = budget, time.perf_counter() + budget
+        while self.busy and left > budget / 3:
+            self._sharpen(view, overlay, left)
+            left = deadline - time.perf_counter() if self._clock.software else 0.0
+
+    def _sharpen(self, view: View, overlay: Overlay, budget: float) -> None:
+        """Some more rows, exactly: first those never drawn, then those out of date."""
+        if not self._scene.marked(view, overlay):
+            self._mark(view, overlay)  # that is enough for one frame
+            return
+        height = view.size[0]
+        start, stop = (self._drawn, height) if self._drawn < height else self._stale
+        scale = min(view.scale)
+        share = self._scene.share(scale)
+        covered = self._covered(view, share)[start:stop]
+        seconds = np.cumsum(self._seconds(scale, view.size[1], covered))
+        affordable = int(np.searchsorted(seconds, budget))
+        stop = min(stop, start + max(MIN_ROWS, affordable))
+        self._draw(self.target, view, overlay, (start, stop), share)
+        if self._drawn < height:
+            self._drawn = stop
+        else:
+            self._stale = stop, self._stale[1]
+        if self._drawn == height:
             self.reduction = 1
 
-    def _affordable(self, view: View, overlay: Overlay) -> int:
-        pixels = view.size[0] * view.size[1]
-        left = BUDGET if overlay == NOTHING else max(BUDGET / 2, BUDGET - self._marks.value)
-        rate = self._rate[self._scene.share(min(view.scale)) > 0].value
-        for reduction in REDUCTIONS:
-            if rate * pixels / reduction**2 <= left:
-                return reduction
-        return REDUCTIONS[-1]
+    def _affordable(self, view: View, budget: float) -> tuple[int, float]:
+        """How small to draw a view, and with what share of Gaussians.
+
+        Gaussians at least as finely as the picture has pixels; if that takes too long, the source.
+        """
+        scale = min(view.scale)
+        share = self._scene.share(scale)
+        pixels, covered = view.size[0] * view.size[1], self._covered(view, share).sum()
+        for shown in (share, 0.0):
+            for reduction in REDUCTIONS:
+                if shown > 0 and scale / reduction < 1:
+                    break
+                area = reduction**2
+                work = pixels / area, covered / area if shown > 0 else 0.0
+                if self._seconds(scale / reduction, *work) <= budget:
+                    return reduction, shown
+        return REDUCTIONS[-1], 0.0
+
+    def _covered(self, view: View, share: float) -> np.ndarray:
+        """(h,) pixels of each row that Gaussians are drawn on."""
+        return self._scene.work(view) if share > 0 else np.zeros(view.size[0])
+
+    def _seconds(
+        self, scale: float, pixels: float, covered: float | np.ndarray
+    ) -> float | np.ndarray:
+        """What so many pixels are expected to take, so many of them covered by Gaussians."""
+        return pixels * self._passes.predict(scale) + covered * self._gaussians.predict(scale)
 
     def _draw(
-        self,
-        target: Target,
-        view: View,
-        overlay: Overlay,
-        rows: tuple[int, int],
-        zoom: float | None = None,
+        self, target: Target, view: View, overlay: Overlay, rows: tuple[int, int], share: float
     ) -> None:
-        zoom = zoom or min(view.scale)
-        took = self._scene.draw(target, view, overlay, rows, zoom)
-        self.seconds = took.picture + took.overlay
+        if not self._scene.marked(view, overlay):
+            self._mark(view, overlay)
+        scale = min(view.scale)
         pixels = (rows[1] - rows[0]) * view.size[1]
-        self._rate[self._scene.share(zoom) > 0].learn(took.picture / pixels)
-        if overlay != NOTHING and rows[0] == 0:
-            self._marks.learn(took.overlay)
+        covered = self._covered(view, share)[slice(*rows)].sum()
+
+        def learn(seconds: float) -> None:
+            """What took the most is held to be what was misjudged."""
+            self.seconds = seconds
+            ratio = seconds / self._seconds(scale, pixels, covered)
+            most = self._gaussians
+            if covered * most.predict(scale) < pixels * self._passes.predict(scale):
+                most = self._passes
+            most.learn(scale, ratio * most.predict(scale))
+
+        with self._clock.measure(learn):
+            self._scene.draw(target, view, overlay, rows, share)
+
+    def _mark(self, view: View, overlay: Overlay) -> None:
+        def learn(seconds: float) -> None:
+            self._marks = seconds
+
+        with self._clock.measure(learn):
+            self._scene.mark(view, overlay)
 
     def _resized(self, target: Target | None, size: tuple[int, int]) -> Target:
         if target is not None:
@@ -158,14 +228,7 @@ class Painter:
         return Target(self._scene.ctx, size)
 
 
-class Average:
-    """A running mean that follows a load within a few frames."""
-
-    WEIGHT = 0.4  # of the newest value
-
-    def __init__(self, value: float) -> None:
-        self.value = max(value, 1e-12)
-
-    def learn(self, value: float) -> None:
-        """Take one more measurement."""
-        self.value = max(self.value + self.WEIGHT * (value - self.value), 1e-12)
+def _reduced(view: View, reduction: int) -> View:
+    """The same part of the picture in fewer pixels."""
+    size = tuple(-(-side // reduction) for side in view.size)
+    return View(view.origin, tuple(side / reduction for side in view.scale), size)

@@ -8,7 +8,7 @@ where Gaussians have not arrived yet.
 from __future__ import annotations
 
 import math
-import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -19,6 +19,8 @@ from gsasr.files import shipped
 from gsasr.view import View
 
 from .coverage import Coverage
+from .mipmaps import Mipmaps, mipmaps
+from .source import Source
 from .state import Rectangle
 
 if TYPE_CHECKING:
@@ -59,14 +61,6 @@ class Target:
         self.texture.release()
 
 
-@dataclass
-class Seconds:
-    """What a drawing took."""
-
-    picture: float = 0.0
-    overlay: float = 0.0
-
-
 class Scene:
     """One picture and its tiles of Gaussians, in one OpenGL context."""
 
@@ -77,10 +71,10 @@ class Scene:
         self._arriving: list[GlTile] = []
         self._changes = 0  # of the tiles so far
         self.overlay_drawn = True  # False where Gaussians lie too close together on the screen
-        self._has_alpha = False
         self._rasterizer = None  # both need torch, which is not imported before the first tile
+        self._warming: Iterator[None] | None = None  # programs still to be compiled
         self._overlays = None
-        self._source: moderngl.Texture | None = None
+        self._source: Source | None = None
         self._coverage: Coverage | None = None
         self._field: moderngl.Texture | None = None
         self._marks: Target | None = None
@@ -89,18 +83,40 @@ class Scene:
         self._pixel = Target(ctx, (1, 1))
 
     def set_picture(self, pixels: np.ndarray) -> None:
-        """Show another picture, (H, W, 4) uint8 RGBA; drops all tiles."""
+        """Show another picture, (H, W, 4) uint8 RGBA, in full at once; drops all tiles."""
+        self.show_picture(mipmaps(pixels))
+        self.load(math.inf)
+
+    def show_picture(self, levels: Mipmaps) -> None:
+        """Show another picture, coarsely until `load` has uploaded it all; drops all tiles."""
         self.clear()
-        self.size = (pixels.shape[0], pixels.shape[1])
-        self._has_alpha = bool((pixels[..., 3] < 255).any())
-        limit = self.ctx.info["GL_MAX_TEXTURE_SIZE"]
-        step = -(-max(self.size) // limit)  # beyond what the GPU can hold, every n-th pixel
-        pixels = np.ascontiguousarray(pixels[::step, ::step])
-        self._source = self.ctx.texture((pixels.shape[1], pixels.shape[0]), 4, pixels, alignment=4)
-        self._source.build_mipmaps()
-        self._source.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
-        self._source.repeat_x = self._source.repeat_y = False
+        self._source = Source(self.ctx, levels)
+        self.size = self._source.size
         self._coverage = Coverage(self.ctx, self.size)
+
+    @property
+    def loading(self) -> bool:
+        """Is there something left to upload or to compile?"""
+        return (self._source is not None and self._source.loading) or self._warming is not None
+
+    def load(self, seconds: float) -> bool:
+        """Upload more of the picture for about so long; True if it can be shown finer now.
+
+        Once all of it is there, compile a program of those that draw Gaussians (see prepare).
+        """
+        if self._source is not None and self._source.loading:
+            return self._source.load(seconds)
+        if self._warming is not None and next(self._warming, "done") == "done":
+            self._warming = None
+        return False
+
+    def prepare(self) -> None:
+        """Tiles of Gaussians will come: be ready to draw them, by and by, as `load` is called."""
+        if self._rasterizer is None:
+            from gsasr.rasterize.gl import GlRasterizer
+
+            self._rasterizer = GlRasterizer(self.ctx)
+            self._warming = self._rasterizer.warming()
 
     def clear(self) -> None:
         """Forget picture and tiles."""
@@ -128,11 +144,7 @@ class Scene:
 
     def add_tile(self, packed: PackedTile) -> None:
         """Add Gaussians of a tile; none is drawn before `cover`. Raises BackendError: no memory."""
-        if self._rasterizer is None:
-            from gsasr.rasterize.gl import GlRasterizer
-
-            self._rasterizer = GlRasterizer(self.ctx)
-            self._rasterizer.warm_up()
+        self.prepare()
         self._arriving.append(self._rasterizer.upload(packed))
 
     def cover(self, core: Rectangle) -> int:
@@ -186,31 +198,60 @@ class Scene:
         view: View,
         overlay: Overlay,
         rows: tuple[int, int] | None = None,
-        zoom: float | None = None,
-    ) -> Seconds:
+        share: float | None = None,
+    ) -> None:
         """Draw output rows [start, stop) of a view (default: all) into the target.
 
-        zoom: the scale that decides how much of the source is shown and how much of the
-            Gaussians, if it is another than the view's.
-
-        An overlay is drawn whole, once, however many bands of rows then show it.
+        share: of the Gaussians, if it is another than that of the view's scale.
         """
-        seconds = Seconds()
         if self._source is None:
             target.framebuffer.clear(*BACKGROUND, 1.0)
-            return seconds
+            return
         start, stop = rows or (0, view.size[0])
-        share = self.share(zoom or min(view.scale))
-        marks = None
-        if overlay.kind != "none" and self._tiles:
-            start_time = time.perf_counter()
-            marks = self._overlay_texture(view, overlay)
-            self.ctx.finish()
-            seconds.overlay = time.perf_counter() - start_time
+        if share is None:
+            share = self.share(min(view.scale))
+        if not self.marked(view, overlay):
+            self.mark(view, overlay)
+        marks = self._marks.texture if overlay.kind != "none" and self._tiles else None
         target.framebuffer.scissor = (0, start, view.size[1], stop - start)
-        self._draw(target.framebuffer, view, (start, stop), share, marks, seconds)
+        self._draw(target.framebuffer, view, (start, stop), share, marks)
         target.framebuffer.scissor = None
-        return seconds
+
+    def work(self, view: View) -> np.ndarray:
+        """(h,) of each output row, the pixels on which tiles of Gaussians lie."""
+        height, width = view.size
+        rows = np.zeros(height)
+        for tile in self.tiles:
+            x0, y0 = view.to_output(*tile.bounds[:2])
+            x1, y1 = view.to_output(*tile.bounds[2:])
+            columns = min(x1, width) - max(x0, 0)
+            start, stop = max(math.floor(y0), 0), min(math.ceil(y1), height)
+            if columns > 0 and start < stop:
+                rows[start:stop] += columns
+        return rows
+
+    def marked(self, view: View, overlay: Overlay) -> bool:
+        """Is the overlay of a view drawn already, or nothing to draw?"""
+        if overlay.kind == "none" or not self._tiles:
+            return True
+        return self._marks_of == (view, overlay, self._changes)
+
+    def mark(self, view: View, overlay: Overlay) -> None:
+        """Draw an overlay on nothing, alpha premultiplied; `draw` shows it in any band of rows."""
+        if self._overlays is None:
+            from .overlays import Overlays
+
+            self._overlays = Overlays(self.ctx)
+        if self._marks is None or self._marks.size != view.size:
+            if self._marks is not None:
+                self._marks.release()
+            self._marks = Target(self.ctx, view.size)
+        target = self._marks.framebuffer
+        target.clear(0.0, 0.0, 0.0, 0.0)
+        self.overlay_drawn = self._overlays.draw(
+            self.tiles, view, target, overlay.kind, overlay.sigma
+        )
+        self._marks_of = view, overlay, self._changes
 
     def color_at(self, view: View, x: int, y: int) -> tuple[int, int, int] | None:
         """8-bit RGB that the picture (no overlay, no checkerboard) has at an output pixel."""
@@ -223,7 +264,7 @@ class Scene:
         # A field texture of its own: the canvas' one would be made anew for every pixel asked.
         field, self._field = self._field, None
         share = self.share(min(view.scale))
-        self._draw(self._pixel.framebuffer, spot, (0, 1), share, None, Seconds(), checkers=False)
+        self._draw(self._pixel.framebuffer, spot, (0, 1), share, None, checkers=False)
         if self._field is not None:
             self._field.release()
         self._field = field
@@ -237,24 +278,28 @@ class Scene:
         rows: tuple[int, int],
         share: float,
         marks: moderngl.Texture | None,
-        seconds: Seconds,
         checkers: bool = True,
     ) -> None:
         """The sum of the Gaussians, then the pass that puts all together."""
-        start = time.perf_counter()
         if share > 0:
             field = self._field_texture(view.size)
             self._rasterizer.draw(self.tiles, view, field, rows=rows)
             field.use(1)
-        has_alpha = self._has_alpha and checkers
+        scale = min(view.scale)
+        has_alpha = self._source.has_alpha and checkers
         with_source = share < 1 or has_alpha or not self._coverage.fills(view)
-        array = self._array(with_source, share > 0, min(view.scale) > 1, marks is not None)
+        magnified = scale > 1 and self._source.finest == 0
+        array = self._array(with_source, share > 0, magnified, marks is not None)
+        finer, coarser, blend = self._source.levels(scale)
         base = [math.floor(value) for value in view.origin]
         values = {
             "base": base,
             "fraction": [at - whole for at, whole in zip(view.origin, base, strict=True)],
             "pixel": [1 / scale for scale in view.scale],
             "size": self.size[::-1],
+            "span": finer.span,
+            "coarser_span": coarser.span,
+            "blend": blend,
             "share": share,
             "covered": self._coverage.span,
             "has_alpha": has_alpha,
@@ -263,35 +308,14 @@ class Scene:
         for name, value in values.items():
             if name in array.program:  # a program has only the uniforms that it needs
                 array.program[name] = value
-        self._source.use(0)
+        finer.texture.use(0)
         self._coverage.texture.use(2)
         if marks is not None:
             marks.use(3)
+        coarser.texture.use(4)
         framebuffer.use()
         self.ctx.disable(moderngl.BLEND)
         array.render(vertices=3)
-        self.ctx.finish()
-        seconds.picture += time.perf_counter() - start
-
-    def _overlay_texture(self, view: View, overlay: Overlay) -> moderngl.Texture:
-        """The overlay on nothing, alpha premultiplied; drawn only if it has changed."""
-        if self._overlays is None:
-            from .overlays import Overlays
-
-            self._overlays = Overlays(self.ctx)
-        if self._marks is None or self._marks.size != view.size:
-            if self._marks is not None:
-                self._marks.release()
-            self._marks, self._marks_of = Target(self.ctx, view.size), None
-        wanted = (view, overlay, self._changes)
-        if wanted != self._marks_of:
-            target = self._marks.framebuffer
-            target.clear(0.0, 0.0, 0.0, 0.0)
-            self.overlay_drawn = self._overlays.draw(
-                self.tiles, view, target, overlay.kind, overlay.sigma
-            )
-            self._marks_of = wanted
-        return self._marks.texture
 
     def _field_texture(self, size: tuple[int, int]) -> moderngl.Texture:
         """A texture (h, w) for sums of Gaussians; kept while the size stays."""

@@ -10,6 +10,7 @@ from gsasr.view import View
 
 from . import export, loading
 from .camera import Camera
+from .mipmaps import Mipmaps, mipmaps
 from .painter import Painter
 from .scene import Overlay, Scene
 from .state import (
@@ -69,7 +70,8 @@ class Session:
 
         def work(task: Task) -> None:
             document = self._loader.open(task, path)
-            self.worker.show(task, lambda: self._show(document))
+            levels = mipmaps(document.pixels)
+            self.worker.show(task, lambda: self._show(document, levels))
             if document.picture is not None:
                 self._plan(task, document, model, condition)
 
@@ -206,8 +208,8 @@ class Session:
 
     # From the worker
 
-    def _show(self, document: Document) -> None:
-        self.scene.set_picture(document.pixels)
+    def _show(self, document: Document, levels: Mipmaps) -> None:
+        self.scene.show_picture(levels)
         self.camera.set_picture(document.size)
         self.painter.reset()
         self.state.message = None

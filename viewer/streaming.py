@@ -79,6 +79,7 @@ class Streaming:
         """On the worker: one tile after another, until there are no more or another task waits."""
         from gsasr.rasterize.gl import pack, split_tiles
 
+        self._worker.show(task, self._scene.prepare)
         try:
             while self._worker.tasks == [task] and (wanted := self._next(tiles)) is not None:
                 index, shown = wanted

@@ -63,6 +63,7 @@ class Worker:
 
     def __init__(self, on_error: Callable[[str], None]) -> None:
         """on_error: called on the window's thread with one sentence."""
+        self.wake: Callable[[], None] = lambda: None  # called when the window has to look again
         self._on_error = on_error
         self._results: queue.SimpleQueue[Result] = queue.SimpleQueue()
         self._present: Result | None = None  # begun, and not at its end
@@ -82,7 +83,7 @@ class Worker:
 
     def show(self, task: Task | None, action: Action) -> None:
         """From the work: have the window's thread call `action`, unless cancelled by then."""
-        self._results.put(Result(task, (action() for _ in range(1))))
+        self._put(Result(task, (action() for _ in range(1))))
 
     def carry_out(self, task: Task, steps: Generator[None, None, None]) -> None:
         """From the work: have the window's thread go through `steps`, over several frames.
@@ -90,7 +91,7 @@ class Worker:
         Returns at their end. Raises Cancelled if the task is; the steps are then closed.
         """
         result = Result(task, steps)
-        self._results.put(result)
+        self._put(result)
         while not result.done.wait(0.1):
             task.check()
         task.check()
@@ -158,6 +159,11 @@ class Worker:
             finally:
                 with self._lock:
                     self._tasks.remove(task)
+                self.wake()
+
+    def _put(self, result: Result) -> None:
+        self._results.put(result)
+        self.wake()
 
     def _fail(self, sentence: str) -> None:
         self.show(None, lambda: self._on_error(sentence))

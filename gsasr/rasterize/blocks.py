@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..view import View
+from .cells import CELL_SIDES
 
 # Consecutive pixels along one axis in one cell: the first, how many, the cell, and from its edge to
 # the centre of pixel count // 2, source pixels (Run in shaders/rasterize.comp)
@@ -103,6 +104,12 @@ def runs(
     middle = begin + (end - begin) // 2
     made["offset"] = centre[middle] - cell[begin] * side
     return made
+
+
+def side_for(view: View) -> float:
+    """The side of cells that suit one view, for want of any figures of the field."""
+    fine = (side for side in CELL_SIDES if side * scale_of(view) >= 4)
+    return next(fine, CELL_SIDES[-1])
 
 
 def scale_of(view: View) -> float:

@@ -15,6 +15,7 @@ from ..errors import FieldError
 from .jit import jit
 from .records import narrow
 
+CELL_SIDES = (1.0, 2.0, 4.0)  # source pixels; small cells for high zooms, large ones for low
 ENTRIES_PER_GAUSSIAN = 30  # beyond this (large Gaussians) cells grow, so memory stays bounded
 CELLS_PER_GAUSSIAN = 4  # likewise for sparse Gaussians
 FEW = 1 << 16  # cells or entries that are fine however few the Gaussians

@@ -3,7 +3,7 @@
 Dropping costs accuracy, so the cut is chosen per Gaussian such that everything dropped at a
 pixel adds up to less than the tolerance of the quality asked for:
 
-- "screen": below half an 8-bit step (1/510), with a margin of two;
+- "screen": below half an 8-bit step (1/510), with a margin of nearly three;
 - "export": below 1e-4, with a margin of two;
 - "gradient": a fixed cut in standard deviations, whatever the opacity, so that a faint Gaussian
   still receives its gradient.
@@ -20,7 +20,7 @@ import torch
 
 from ..gaussians import Gaussians
 
-TOLERANCE = {"screen": 1e-3, "export": 5e-5}
+TOLERANCE = {"screen": 7e-4, "export": 5e-5}
 GRADIENT_CUT = 5.0**2  # tails of second moments: (1 + k^2/2) exp(-k^2/2) = 5e-5
 
 

@@ -140,7 +140,8 @@ class GlRasterizer:
         """The same, one program per step."""
         usual = [_Variant(TARGETS[dtype], block) for block in self.shape.blocks]
         for variant in (*usual, _Variant(TARGETS[dtype], self.shape.steep, steep=True)):
-            target = self.ctx.texture((1, 1), 4, dtype=dtype)
+            # No power of two: llvmpipe compiles anew for sides that are none.
+            target = self.ctx.texture((3, 3), 4, dtype=dtype)
             target.bind_to_image(0, read=True, write=True)
             program = self._program(variant)
             program["window"] = 0, 0, 0, 0  # no runs: every thread ends at once
@@ -347,10 +348,11 @@ def _render(gaussians: Gaussians, view: View, quality: str) -> np.ndarray:
     image = np.zeros((*view.size, 3), np.float32)
     if image.size == 0 or len(gaussians) == 0:
         return image
+    sides = (blocks.side_for(view),)  # the only view of these tiles
     held: list[GlTile] = []
     try:
         for part in split_tiles(visible(gaussians, view, quality)):
-            held.append(rasterizer.upload(pack(part, quality)))
+            held.append(rasterizer.upload(pack(part, quality, sides)))
             if sum(tile.nbytes for tile in held) > HELD:
                 _add(rasterizer, held, view, image)
         _add(rasterizer, held, view, image)

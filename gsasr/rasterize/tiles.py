@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from . import cells, records
-from .cells import Cells
+from .cells import CELL_SIDES, Cells
 from .jit import jit
 from .records import Records
 
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 SIDE = 256  # of a tile, source pixels
 MOST = 1_100_000  # Gaussians in a tile: none of its buffers exceeds 128 MiB, the usual limit
-CELL_SIDES = (1.0, 2.0, 4.0)  # source pixels; small cells for high zooms, large ones for low
 THINNEST = 1e-12  # source pixels; thinner would overflow, and no sample ever meets it
 
 

@@ -1,0 +1,14 @@
+// Each row of a block starts with exponentials of its own; only along it one multiplies.
+void add(vec3 whiten, vec3 peak, vec2 d)
+{
+    float right = whiten.x * pixel_size.x, fall = exp2(-2.0 * right * right);
+    for (int row = 0; row < BLOCK; ++row) {
+        float y = d.y + float(row - MIDDLE) * pixel_size.y;
+        float u = whiten.x * d.x + whiten.y * y, v = whiten.z * y;
+        float along = exp2(-right * (right + 2.0 * u)), back = exp2(-right * (right - 2.0 * u));
+        vec3 middle = peak * exp2(-(u * u + v * v)), color = middle;
+        RIGHT(0) RIGHT(1) RIGHT(2) RIGHT(3) RIGHT(4)
+        color = middle;
+        LEFT(1) LEFT(2) LEFT(3) LEFT(4) LEFT(5)
+    }
+}

@@ -40,7 +40,7 @@ from paths import zoom_and_pan
 from gsasr import image
 from gsasr.gaussians import Gaussians
 from gsasr.model import load_model
-from gsasr.predict import predict
+from gsasr.prediction import predict
 from gsasr.rasterize import gl
 from gsasr.view import View
 

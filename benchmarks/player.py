@@ -97,8 +97,7 @@ def send(worker: Worker, scene: Scene, painter: Painter, field: Gaussians) -> Ta
         for part, core in split(field):
             for piece in gl.split_tiles(part):
                 task.check()
-                packed = gl.pack(piece)
-                worker.show(task, lambda packed=packed: scene.add_tile(packed))
+                worker.carry_out(task, scene.adding(gl.pack(piece)))
             worker.show(task, lambda core=core: cover(core))
 
     return worker.post("Packing", work)

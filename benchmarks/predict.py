@@ -20,7 +20,7 @@ from gsasr import image, rasterize
 from gsasr.files import shipped
 from gsasr.model import GSASR, PRESETS, load_model
 from gsasr.model.checkpoint import SHIPPED
-from gsasr.predict import predict
+from gsasr.prediction import predict
 from gsasr.processor import PRECISIONS
 from gsasr.view import View
 

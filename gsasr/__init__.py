@@ -17,7 +17,7 @@ _HOME = {
     "GsasrError": "errors",
     "View": "view",
     "load_model": "model",
-    "predict": "predict",
+    "predict": "prediction",
     "render": "picture",
     "upscale": "picture",
 }

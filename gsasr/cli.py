@@ -84,7 +84,7 @@ def predict(options: argparse.Namespace) -> None:
     from .errors import FieldError
     from .files import check_writable
     from .model import load_model
-    from .predict import predict
+    from .prediction import predict
 
     if options.output.suffix != ".safetensors":
         raise FieldError(f"{options.output} must end in .safetensors.")

@@ -70,7 +70,7 @@ def _numba() -> Iterator[Finding]:
 
 
 def _opengl() -> Iterator[Finding]:
-    from .rasterize import driver, gl
+    from .rasterize import driver, gl, opengl
 
     try:
         info = gl.driver()
@@ -83,7 +83,7 @@ def _opengl() -> Iterator[Finding]:
     yield Finding("OpenGL", f"{info['GL_VERSION']}, {info['GL_RENDERER']} ({kind})", advice)
     limits = (f"{name} {info[key]:,} {unit}" for key, (name, unit) in GL_LIMITS.items())
     yield Finding("OpenGL limits", "; ".join(limits))
-    yield Finding("GPU memory", _memory(driver.headless_memory()))
+    yield Finding("GPU memory", _memory(opengl.ask(driver.video_memory)))
 
 
 def _memory(memory: VideoMemory) -> str:

@@ -13,7 +13,7 @@ from .errors import Cancelled, RequestError
 from .gaussians import Gaussians
 from .memory import require_picture
 from .model import GSASR
-from .predict import TILE, predict_tiles
+from .prediction import TILE, predict_tiles
 from .rasterize import footprint
 from .rasterize.antialias import integrated
 from .rasterize.tiles import split_tiles

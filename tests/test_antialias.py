@@ -9,7 +9,7 @@ from PIL import Image
 from gsasr import cli, image, picture
 from gsasr.gaussians import Gaussians
 from gsasr.model import load_model, save_model
-from gsasr.predict import predict
+from gsasr.prediction import predict
 from gsasr.rasterize import antialias, reference, render
 from gsasr.rasterize.antialias import FOOTPRINT, integrated
 from gsasr.view import View

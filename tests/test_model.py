@@ -16,7 +16,7 @@ from gsasr.model.attention import (
     turned,
 )
 from gsasr.model.encoders.swinir import shift_mask
-from gsasr.predict import predict
+from gsasr.prediction import predict
 from gsasr.rasterize import reference
 from gsasr.view import View
 

@@ -9,7 +9,7 @@ from gsasr import image
 from gsasr.errors import Cancelled, RequestError
 from gsasr.model import GSASR, activate, load_model
 from gsasr.picture import conditioning_scale, render, resample_alpha, upscale
-from gsasr.predict import plan, predict, predict_tile, predict_tiles
+from gsasr.prediction import plan, predict, predict_tile, predict_tiles
 from gsasr.processor import PRECISIONS
 from gsasr.rasterize import reference
 from gsasr.view import View
@@ -115,7 +115,7 @@ def starved(monkeypatch, largest: int, error: Exception) -> list[int]:
             raise error
         return whole(model, image, tile, *arguments)
 
-    monkeypatch.setattr("gsasr.predict.predict_tile", limited)
+    monkeypatch.setattr("gsasr.prediction.predict_tile", limited)
     return sides
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -82,7 +81,7 @@ def test_where_the_budget_suffices_every_frame_is_exact(scene):
     painter = Painter(scene)
     task = send(worker, scene, painter, field)
     while task in worker.tasks:
-        time.sleep(0.01)
+        worker.deliver(0.01)
     worker.deliver(60.0)
     worker.stop()
     painter.budget = 1e3

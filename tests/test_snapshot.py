@@ -10,7 +10,7 @@ from viewer_scenarios import assert_shows, make_field
 
 from gsasr import image
 from gsasr.model import save_model
-from gsasr.predict import predict
+from gsasr.prediction import predict
 from gsasr.view import View
 
 

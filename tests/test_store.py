@@ -235,7 +235,8 @@ class FakeScene:
         self.there: set = set()
         self.arriving = 0
 
-    def add_tile(self, piece) -> None:
+    def adding(self, piece):
+        yield
         if len(self.there) >= self.room:
             raise BackendError("full")
         self.arriving += 1

@@ -13,7 +13,6 @@ import time
 import traceback
 from collections.abc import Callable
 from contextlib import contextmanager
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -380,7 +379,7 @@ def a_large_picture_comes_and_goes_by_tiles(ui: Ui, folder: Path) -> None:
     from PIL import Image
 
     from gsasr import image, load_model
-    from gsasr.predict import predict
+    from gsasr.prediction import predict
 
     path, target = folder / "wide.png", folder / "wide-view.png"
     rng = np.random.default_rng(0)
@@ -429,18 +428,19 @@ def showing(session, path: Path) -> bool:
 @contextmanager
 def counted_predictions():
     """A list that grows by one with each tile that is predicted."""
-    module = import_module("gsasr.predict")  # whose name in the package is a function's
-    predicted, predict_tile = [], module.predict_tile
+    from gsasr import prediction
+
+    predicted, predict_tile = [], prediction.predict_tile
 
     def counted(model, picture, tile, *options):
         predicted.append(tile)
         return predict_tile(model, picture, tile, *options)
 
-    module.predict_tile = counted
+    prediction.predict_tile = counted
     try:
         yield predicted
     finally:
-        module.predict_tile = predict_tile
+        prediction.predict_tile = predict_tile
 
 
 def a_full_gpu_is_a_message_and_a_smaller_budget(ui: Ui, folder: Path) -> None:
@@ -452,14 +452,14 @@ def a_full_gpu_is_a_message_and_a_smaller_budget(ui: Ui, folder: Path) -> None:
     rng = np.random.default_rng(0)
     Image.fromarray(rng.integers(0, 255, (40, 900, 3), dtype=np.uint8)).save(path)
     session, most = ui.session, ui.session.state.gpu_memory
-    upload = type(session.scene).add_tile
+    upload = type(session.scene).adding
 
-    def full(scene, packed) -> None:
+    def full(scene, packed):
         if session.state.document.tiles.shown_bytes > 6_000_000:
             raise BackendError("full")
-        upload(scene, packed)
+        yield from upload(scene, packed)
 
-    type(session.scene).add_tile = full
+    type(session.scene).adding = full
     try:
         session.open(path)
         ui.until(lambda: showing(session, path))
@@ -476,7 +476,7 @@ def a_full_gpu_is_a_message_and_a_smaller_budget(ui: Ui, folder: Path) -> None:
         ui.until(lambda: session.scene.covers(ui.view()))
         ui.rest()
     finally:
-        type(session.scene).add_tile, session.state.gpu_memory = upload, most
+        type(session.scene).adding, session.state.gpu_memory = upload, most
         session.state.message = None
 
 

@@ -78,7 +78,7 @@ class Loader:
         _load_torch()
         model = self._load(model_name)
         task.check()
-        from gsasr.predict import check, plan, predict_tile
+        from gsasr.prediction import check, plan, predict_tile
 
         image = document.picture.color
         check(image, condition)

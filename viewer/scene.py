@@ -144,8 +144,13 @@ class Scene:
 
     def add_tile(self, packed: PackedTile) -> None:
         """Add Gaussians of a tile; none is drawn before `cover`. Raises BackendError: no memory."""
+        for _ in self.adding(packed):
+            pass
+
+    def adding(self, packed: PackedTile) -> Iterator[None]:
+        """The same in steps of a few milliseconds."""
         self.prepare()
-        self._arriving.append(self._rasterizer.upload(packed))
+        self._arriving.append((yield from self._rasterizer.uploading(packed)))
 
     def cover(self, core: Rectangle) -> int:
         """What was added is all of a rectangle: show it where its neighbours' are there, too.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 OVERLAYS = ("none", "centers", "ellipses")
 SIGMA = (0.5, 4.0)  # least and greatest size of the drawn ellipses, standard deviations
 CONDITION = (1.0, 4.0)  # scales that the networks are trained for
-TOLD = 3.0  # the one told by default, as in gsasr.predict, which would load PyTorch
+TOLD = 3.0  # the one told by default, as in gsasr.prediction, which would load PyTorch
 
 LEAST_MEMORY = 1 << 24  # bytes of Gaussians that the user can let the GPU hold
 

@@ -107,8 +107,7 @@ class Streaming:
             self._painter.invalidate()
         try:
             for piece in pieces:
-                self._scene.add_tile(piece)
-                yield
+                yield from self._scene.adding(piece)
             tiles.show(index, self._scene.cover(core))
             self._repaint(core)
         except BackendError:

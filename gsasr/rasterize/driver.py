@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import ctypes
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import moderngl
 
 from ..memory import available
-from .opengl import create_context, software
+from .opengl import software
 
 NVX_DEDICATED, NVX_FREE = 0x9047, 0x9049  # GL_NVX_gpu_memory_info, KiB
 ATI_FREE = 0x87FB  # GL_ATI_meminfo, for buffers: four numbers, the first is what is free, KiB
@@ -46,21 +45,6 @@ def video_memory(ctx: moderngl.Context) -> VideoMemory:
     if software(ctx.info):
         return VideoMemory(None, None, max(LEAST, int(SOFTWARE_SHARE * available())))
     return VideoMemory(None, None, UNKNOWN)
-
-
-def headless_memory() -> VideoMemory:
-    """The same of a context of its own. Raises BackendError where there is none."""
-
-    def ask() -> VideoMemory:
-        ctx = create_context()
-        try:
-            return video_memory(ctx)
-        finally:
-            ctx.release()
-
-    # On a thread of its own, as a new context would displace the caller's.
-    with ThreadPoolExecutor(1, thread_name_prefix="gl-memory") as thread:
-        return thread.submit(ask).result()
 
 
 def lost(ctx: moderngl.Context) -> bool:

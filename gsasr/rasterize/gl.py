@@ -7,7 +7,7 @@ cells of the source image (tiles.py, cells.py), and a frame of any zoom only rea
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -42,6 +42,7 @@ TARGETS = {"f2": "rgba16f", "f4": "rgba32f"}
 BLOCK = 4096  # widest piece that `render` draws at once, pixels
 PIXELS = 1 << 22  # most pixels in such a piece: 64 MiB
 PORTION = 1 << 15  # most pairs of a list that are read at once: llvmpipe ends loops at 2^16
+STEP = 1 << 22  # bytes of a tile that are uploaded at once
 HELD = 1 << 29  # bytes of tiles that `render` holds on the GPU at once, about
 
 
@@ -155,17 +156,36 @@ class GlRasterizer:
 
         Raises BackendError when the GPU has no room for it.
         """
-        if not isinstance(tile, PackedTile):
-            tile = pack(tile, quality)
+        steps = self.uploading(tile if isinstance(tile, PackedTile) else pack(tile, quality))
+        while True:
+            try:
+                next(steps)
+            except StopIteration as end:
+                return end.value
+
+    def uploading(self, tile: PackedTile) -> Generator[None, None, GlTile]:
+        """The same in steps of a few milliseconds, between which frames can be drawn.
+
+        What is there is freed if the steps are not gone through.
+        """
         arrays = [tile.records.data, *(a for c in tile.levels for a in (c.lists, c.entries))]
-        # A buffer cannot be empty.
-        buffers = [self.ctx.buffer(a) if a.size else self.ctx.buffer(reserve=32) for a in arrays]
-        if self.ctx.error == "GL_OUT_OF_MEMORY":
+        buffers: list[moderngl.Buffer] = []
+        try:
+            for array in arrays:
+                # A buffer cannot be empty.
+                buffers.append(self.ctx.buffer(reserve=max(array.nbytes, 32)))
+                if self.ctx.error == "GL_OUT_OF_MEMORY":
+                    raise BackendError(
+                        "The GPU is out of memory; close other programs or use --backend cpu."
+                    )
+                data = array.reshape(-1).view(np.uint8)
+                for start in range(0, len(data), STEP):
+                    buffers[-1].write(data[start : start + STEP], offset=start)
+                    yield
+        except BaseException:
             for buffer in buffers:
                 buffer.release()
-            raise BackendError(
-                "The GPU is out of memory; close other programs or use --backend cpu."
-            )
+            raise
         levels = tuple(
             GlLevel(
                 cells.side,

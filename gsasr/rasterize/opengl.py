@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 import moderngl
 
 from ..errors import BackendError
 from ..files import shipped
 
+T = TypeVar("T")
 SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software rasterizer", "swiftshader")
 
 
@@ -36,20 +39,25 @@ def create_context() -> moderngl.Context:
         ) from failure
 
 
+def ask(question: Callable[[moderngl.Context], T]) -> T:
+    """What a headless context answers. Raises BackendError if there is none."""
+
+    def answer() -> T:
+        ctx = create_context()
+        try:
+            return question(ctx)
+        finally:
+            ctx.release()
+
+    # On a thread of its own, as a new context would displace the caller's.
+    with ThreadPoolExecutor(1, thread_name_prefix="gl-probe") as thread:
+        return thread.submit(answer).result()
+
+
 @functools.cache
 def driver() -> dict:
     """What a headless context says of itself, by OpenGL's names. Raises BackendError if none."""
-    # On a thread of its own, as a new context would displace the caller's.
-    with ThreadPoolExecutor(1, thread_name_prefix="gl-probe") as thread:
-        return thread.submit(_ask_driver).result()
-
-
-def _ask_driver() -> dict:
-    ctx = create_context()
-    try:
-        return dict(ctx.info)
-    finally:
-        ctx.release()
+    return ask(lambda ctx: dict(ctx.info))
 
 
 def software(info: dict) -> bool:

@@ -18,7 +18,7 @@ from ..errors import DataError, RequestError
 from ..evaluation.metrics import psnr_y
 from ..model import GSASR, activate, save_model
 from ..model import PRESETS as MODELS
-from ..predict import predict
+from ..prediction import predict
 from ..view import View
 from .config import ORDINARY, Execution, TrainConfig
 from .data import CropSampler, Sample, validation_samples

@@ -19,6 +19,9 @@ from ..errors import BackendError, RequestError
 from ..view import View
 from . import blocks
 from .blocks import HARDWARE, RUN, SOFTWARE, Load, Shape
+from .cells import CELL_SIDES
+from .gl_index import GlIndex
+from .gl_tile import GlLevel, GlTile, allocate
 from .opengl import create_context, driver, hardware, load_shader, software
 from .tiles import PackedTile, pack, split_tiles, visible
 
@@ -46,59 +49,6 @@ HELD = 1 << 29  # bytes of tiles that `render` holds on the GPU at once, about
 
 
 @dataclass(frozen=True)
-class GlLevel:
-    """One index of a tile on the GPU (see cells.Cells)."""
-
-    side: float
-    first: tuple[int, int]
-    shape: tuple[int, int]
-    lists: moderngl.Buffer
-    entries: moderngl.Buffer
-    wide: bool
-    ordinary: int  # entries in ordinary lists, and in steep ones
-    steep: int
-    longest: int
-
-
-@dataclass(frozen=True)
-class GlTile:
-    """A PackedTile on the GPU. `count` Gaussians; the rest as in PackedTile and Records."""
-
-    count: int
-    origin: tuple[int, int]
-    bounds: tuple[float, float, float, float]
-    extent: tuple[float, float, float, float]
-    largest: float
-    records: moderngl.Buffer
-    unpacking: tuple[float, float, float] | None
-    levels: tuple[GlLevel, ...]
-
-    @property
-    def nbytes(self) -> int:
-        """Video memory it holds."""
-        lists = sum(level.lists.size + level.entries.size for level in self.levels)
-        return self.records.size + lists
-
-    def meets(self, view: View) -> bool:
-        """Whether any of it can be seen."""
-        x0, y0 = view.origin
-        x1, y1 = view.to_source(view.size[1], view.size[0])
-        return (
-            self.bounds[0] < x1
-            and x0 < self.bounds[2]
-            and self.bounds[1] < y1
-            and y0 < self.bounds[3]
-        )
-
-    def release(self) -> None:
-        """Free the video memory; on the thread of the context."""
-        self.records.release()
-        for level in self.levels:
-            level.lists.release()
-            level.entries.release()
-
-
-@dataclass(frozen=True)
 class _Variant:
     """Which of the programs made of rasterize.comp."""
 
@@ -121,10 +71,16 @@ class _Runs:
 class GlRasterizer:
     """Draws tiles of Gaussians with a given context, on that context's thread."""
 
-    def __init__(self, ctx: moderngl.Context, shape: Shape | None = None) -> None:
-        """shape: what suits the device (see blocks.Shape), if not what its kind suggests."""
+    def __init__(
+        self, ctx: moderngl.Context, shape: Shape | None = None, index: bool | None = None
+    ) -> None:
+        """shape: what suits the device (see blocks.Shape), if not what its kind suggests.
+        index: whether shaders index Gaussians, if not as its kind suggests (a GPU does).
+        """
         self.ctx = ctx
-        self.shape = shape or (SOFTWARE if software(ctx.info) else HARDWARE)
+        emulated = software(ctx.info)
+        self.shape = shape or (SOFTWARE if emulated else HARDWARE)
+        self._index = GlIndex(ctx) if index or (index is None and not emulated) else None
         self._programs: dict[_Variant, moderngl.ComputeShader] = {}
         self._buffers: dict[tuple[float, int], moderngl.Buffer] = {}
 
@@ -150,22 +106,28 @@ class GlRasterizer:
             target.release()
             yield
 
-    def upload(self, tile: PackedTile | Gaussians, quality: str = "screen") -> GlTile:
-        """The tile on the GPU. Gaussians are packed first, which is better done on a worker.
+    @property
+    def packs(self) -> bool:
+        """Should Gaussians be packed on a worker, since `upload` would do it on the CPU?"""
+        return self._index is None
+
+    def upload(
+        self,
+        tile: PackedTile | Gaussians,
+        quality: str = "screen",
+        sides: tuple[float, ...] = CELL_SIDES,
+    ) -> GlTile:
+        """The tile on the GPU; quality, sides: as in `pack`, of Gaussians that are not yet packed.
 
         Raises BackendError when the GPU has no room for it.
         """
         if not isinstance(tile, PackedTile):
-            tile = pack(tile, quality)
+            made = self._index.build(tile, quality, sides) if self._index else None
+            if made is not None:
+                return made
+            tile = pack(tile, quality, sides)
         arrays = [tile.records.data, *(a for c in tile.levels for a in (c.lists, c.entries))]
-        # A buffer cannot be empty.
-        buffers = [self.ctx.buffer(a) if a.size else self.ctx.buffer(reserve=32) for a in arrays]
-        if self.ctx.error == "GL_OUT_OF_MEMORY":
-            for buffer in buffers:
-                buffer.release()
-            raise BackendError(
-                "The GPU is out of memory; close other programs or use --backend cpu."
-            )
+        buffers = allocate(self.ctx, arrays)
         levels = tuple(
             GlLevel(
                 cells.side,
@@ -238,6 +200,8 @@ class GlRasterizer:
             held.release()
         self._programs.clear()
         self._buffers.clear()
+        if self._index is not None:
+            self._index.release()
 
     def _clear(self, target: moderngl.Texture, start: int, stop: int) -> None:
         framebuffer = self.ctx.framebuffer([target])
@@ -352,7 +316,7 @@ def _render(gaussians: Gaussians, view: View, quality: str) -> np.ndarray:
     held: list[GlTile] = []
     try:
         for part in split_tiles(visible(gaussians, view, quality)):
-            held.append(rasterizer.upload(pack(part, quality, sides)))
+            held.append(rasterizer.upload(part, quality, sides))
             if sum(tile.nbytes for tile in held) > HELD:
                 _add(rasterizer, held, view, image)
         _add(rasterizer, held, view, image)

@@ -48,13 +48,26 @@ def make(
     """
     full = np.zeros((len(rho) + 1, 8), np.float32)
     narrowest, widest, brightest, farthest = _full(mean, std, rho, peak, full)
-    step = farthest / STEPS
-    fits = FEWEST_STEPS * step <= narrowest and widest <= WIDEST and np.isfinite(brightest)
-    if not (packed and fits and len(rho)):
+    unpacking = unpacking_of(narrowest, widest, brightest, farthest)
+    if not (packed and unpacking and len(rho)):
         return Records(full, None)
     short = np.empty((len(full), 4), np.uint32)
-    _pack(full, full[:, 2:5].astype(np.float16).view(np.uint16), step, brightest, short)
-    return Records(short, (step, brightest / 4095.0, brightest / 65535.0))
+    _pack(full, full[:, 2:5].astype(np.float16).view(np.uint16), unpacking[0], brightest, short)
+    return Records(short, unpacking)
+
+
+def unpacking_of(
+    narrowest: float, widest: float, brightest: float, farthest: float
+) -> tuple[float, float, float] | None:
+    """Records.unpacking where short records hold such Gaussians, else None.
+
+    narrowest, widest: semi-axis and standard deviation, brightest: of the peaks, farthest: of the
+    means from the tile's origin along an axis.
+    """
+    step = farthest / STEPS
+    if FEWEST_STEPS * step <= narrowest and widest <= WIDEST and math.isfinite(brightest):
+        return step, brightest / 4095.0, brightest / 65535.0
+    return None
 
 
 @jit

@@ -39,7 +39,10 @@ MAXIMA = (
     "UNFIT",  # 1 if the tile is not for these shaders
     "FIRST_COLUMN", "FIRST_ROW", "LAST_COLUMN", "LAST_ROW",  # cells of side 1 that are met
 )  # fmt: skip
-LEVEL_MAXIMA = ("LONGEST", "SPAN")  # pairs in a list; from the least place in a cell to the greatest
+LEVEL_MAXIMA = (
+    "LONGEST",
+    "SPAN",
+)  # pairs in a list; from the least place in a cell to the greatest
 SUMS = ("BOXES",)  # cells in bounding boxes, in units of 8
 LEVEL_SUMS = ("PAIRS", "ORDINARY", "STEEP")  # pairs of entries; entries of either kind
 SLOTS = {

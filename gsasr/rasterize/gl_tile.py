@@ -65,9 +65,7 @@ class GlTile:
             level.entries.release()
 
 
-def allocate(
-    ctx: moderngl.Context, contents: Iterable[np.ndarray | int]
-) -> list[moderngl.Buffer]:
+def allocate(ctx: moderngl.Context, contents: Iterable[np.ndarray | int]) -> list[moderngl.Buffer]:
     """A buffer of each array, or of so many bytes. Raises BackendError if there is no room."""
     buffers = []
     for content in contents:

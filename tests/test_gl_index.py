@@ -216,6 +216,17 @@ def test_the_cut_counts_areas_beyond_32_bits(build):
     tile.release()
 
 
+def test_gaussians_that_lie_side_by_side_in_memory_are_not_copied():
+    field = random_field(300, (20, 20))
+    for start in (0, 7):
+        (tile,) = tiles.split_tiles(field[start:])
+        for part in (tile, tile[2:9], tile[::2]):
+            table = gl_index._table(part)
+            assert np.shares_memory(table, part.std.numpy()) == (part.std.stride(0) == 9)
+            columns = [t.reshape(len(part), -1) for t in part.tensors().values()]
+            np.testing.assert_array_equal(table, torch.cat(columns, dim=1).numpy())
+
+
 @pytest.mark.parametrize("quality", TOLERANCE)
 def test_a_tile_tells_of_itself_what_a_packed_one_tells(rasterizer, build, quality):
     field = random_field(3000, (40, 50))

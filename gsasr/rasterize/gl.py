@@ -93,7 +93,7 @@ class GlRasterizer:
             pass
 
     def warming(self, dtype: str = "f2") -> Iterator[None]:
-        """The same, one program per step."""
+        """The same, one program of `draw` per step, and those of the index in the last."""
         usual = [_Variant(TARGETS[dtype], block) for block in self.shape.blocks]
         for variant in (*usual, _Variant(TARGETS[dtype], self.shape.steep, steep=True)):
             # No power of two: llvmpipe compiles anew for sides that are none.
@@ -104,6 +104,9 @@ class GlRasterizer:
             program.run(1, 1)
             self.ctx.finish()
             target.release()
+            yield
+        if self._index is not None:
+            self._index.warm_up()
             yield
 
     @property

@@ -67,6 +67,7 @@ TABLES = {
     "starts": (4, 2 * CELLS + 1),
     "spans": (5, 2 * CELLS),
 }
+PROGRAMS = ("clear", "measure", "load", "densest", "place", "cells", "pairs", "lists", "records")
 ALIGNMENT = 64  # uint32; the most that a driver may demand of a table's offset
 DEFINES = {
     **SLOTS,
@@ -101,6 +102,12 @@ class GlIndex:
             self._offsets[name] = end
             end += -(-size // ALIGNMENT) * ALIGNMENT
         self._table_size = end
+
+    def warm_up(self) -> None:
+        """Compile all that `build` needs for the screen, lest a first tile wait for it."""
+        for name in PROGRAMS:
+            self._program(name, packed=name == "records")
+        self._scan.warm_up()
 
     def build(
         self, gaussians: Gaussians, quality: str, sides: tuple[float, ...] = CELL_SIDES
@@ -222,11 +229,7 @@ class GlIndex:
         **uniforms: object,
     ) -> None:
         """One shader over so many threads."""
-        if (name, packed) not in self._programs:
-            defines = {**DEFINES, **({"PACKED": 1} if packed else {})}
-            source = load_shader(self.ctx, f"index_{name}.comp", defines)
-            self._programs[name, packed] = self.ctx.compute_shader(source)
-        program = self._programs[name, packed]
+        program = self._program(name, packed)
         work.raw.bind_to_storage_buffer(0)
         work.places.bind_to_storage_buffer(2)
         for table in ("found", *tables):
@@ -240,14 +243,18 @@ class GlIndex:
 
     def _clear(self, buffer: moderngl.Buffer) -> None:
         """By a shader: moderngl itself would do it on the CPU, and wait for the GPU first."""
-        if ("clear", False) not in self._programs:
-            source = load_shader(self.ctx, "clear.comp", {"THREADS": THREADS})
-            self._programs["clear", False] = self.ctx.compute_shader(source)
-        program = self._programs["clear", False]
+        program = self._program("clear")
         buffer.bind_to_storage_buffer(0)
         program["count"] = buffer.size // 4
         program.run(min(1 << 14, -(-buffer.size // (4 * THREADS))))
         self.ctx.memory_barrier()
+
+    def _program(self, name: str, packed: bool = False) -> moderngl.ComputeShader:
+        if (name, packed) not in self._programs:
+            defines = {**DEFINES, **({"PACKED": 1} if packed else {})}
+            source = load_shader(self.ctx, f"index_{name}.comp", defines)
+            self._programs[name, packed] = self.ctx.compute_shader(source)
+        return self._programs[name, packed]
 
 
 class PrefixSum:
@@ -260,13 +267,17 @@ class PrefixSum:
         self._programs: list[moderngl.ComputeShader] = []
         self._sums: list[moderngl.Buffer] = []  # of blocks, of blocks of these, and so on
 
-    def run(self, values: moderngl.Buffer, start: int, count: int, depth: int = 0) -> None:
-        """Of `count` values from number `start` on, which must be a multiple of ALIGNMENT."""
+    def warm_up(self) -> None:
+        """Compile what `run` needs."""
         if not self._programs:
             for defines in ({}, {"CARRY": 1}):
                 sizes = {"THREADS": THREADS, "BLOCK": self.BLOCK}
-                source = load_shader(self.ctx, "scan.comp", sizes | defines)
+                source = load_shader(self.ctx, "prefix_sum.comp", sizes | defines)
                 self._programs.append(self.ctx.compute_shader(source))
+
+    def run(self, values: moderngl.Buffer, start: int, count: int, depth: int = 0) -> None:
+        """Of `count` values from number `start` on, which must be a multiple of ALIGNMENT."""
+        self.warm_up()
         blocks = -(-count // self.BLOCK)
         if depth == len(self._sums):
             self._sums += allocate(self.ctx, [4 * blocks])
@@ -390,11 +401,21 @@ def _single(gaussians: Gaussians) -> bool:
 
 
 def _table(gaussians: Gaussians) -> np.ndarray:
-    """(N, 9) float32: mean, std, rho, color, opacity."""
+    """(N, 9) float32: mean, std, rho, color, opacity. Not copied if they lie so in memory, as those
+    of split_tiles do: the copy takes longer than all that the GPU does."""
     import torch
 
-    columns = [t.detach().reshape(len(gaussians), -1) for t in gaussians.tensors().values()]
-    return torch.cat(columns, dim=1).float().cpu().numpy()
+    count, tensors = len(gaussians), [t.detach().cpu() for t in gaussians.tensors().values()]
+    mean = tensors[0]
+    sizes = [t[:1].numel() for t in tensors]
+    if all(
+        t.dtype == torch.float32
+        and t.stride() == (9, 1)[: t.ndim]
+        and t.data_ptr() == mean.data_ptr() + 4 * sum(sizes[:i])
+        for i, t in enumerate(tensors)
+    ):
+        return mean.as_strided((count, 9), (9, 1)).numpy()
+    return torch.cat([t.reshape(count, -1) for t in tensors], dim=1).float().numpy()
 
 
 def _float(bits: int) -> float:

@@ -11,6 +11,8 @@ of them alike; the first frame of each is not counted, and one that is slow draw
 
 time: of the GPU, by timer queries; on software OpenGL and of what runs without OpenGL, wall time
     until the frame has finished.
+by shaders: the same, of tiles that have been split: uploading them and what compute shaders then
+    make of them, by timer queries, which on a GPU include its waiting for the CPU in between.
 evaluations: pairs of a pixel and a Gaussian that the frame looks at. For lists, every pixel times
     the length of the list that it reads; for boxes and ellipses, the pixels within. They are
     counted on the CPU, from the index, for the view; the rate divides by the median time.
@@ -33,6 +35,7 @@ import moderngl
 import numpy as np
 import torch
 from contestants import CONTESTANTS, Contestant, Ours
+from contestants.contestant import gl_seconds
 from fields import plane
 from measure import machine
 from paths import zoom_and_pan
@@ -148,7 +151,8 @@ def statistics(report: Report, drawn: Gaussians, made: list[Contestant]) -> None
         f"Standard deviations: {middle:.3f} source pixels (median), 5 % below {low:.3f}, 5 % above "
         f"{high:.3f}. Lists of {made[0].mean_list():.0f} Gaussians per cell of the finest index.\n"
     )
-    report.header("rasterizer", "Gaussians, bytes each", "index, bytes each", "all, MiB", "made in")
+    report.header("rasterizer", "Gaussians, bytes each", "index, bytes each", "all, MiB", "made in",
+                  "by shaders")  # fmt: skip
     for each in made:
         seconds = [f"{s:.2f} s ({threads} threads)" for threads, s in each.seconds.items()]
         report.row(
@@ -157,6 +161,7 @@ def statistics(report: Report, drawn: Gaussians, made: list[Contestant]) -> None
             f"{each.index / len(drawn):.1f}",
             f"{(each.gaussians + each.index) / 2**20:.1f}",
             ", ".join(seconds).replace("(1 threads)", "(1 thread)") or "-",
+            "-" if each.shader_seconds is None else f"{each.shader_seconds:.3g} s",
         )
     report.line("")
 
@@ -243,16 +248,11 @@ def compare(
 
 def draw(ctx: moderngl.Context, contestant: Contestant, view: View) -> float:
     """Seconds of one frame."""
-    if contestant.uses_gl and not gl.software(ctx.info):
-        query = ctx.query(time=True)
-        with query:
-            contestant.draw(view)
-        return query.elapsed / 1e9
+    if contestant.uses_gl:
+        return gl_seconds(ctx, lambda: contestant.draw(view))
     ctx.finish()
     start = time.perf_counter()
     contestant.draw(view)
-    if contestant.uses_gl:
-        ctx.finish()
     return time.perf_counter() - start
 
 

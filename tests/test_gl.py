@@ -26,7 +26,7 @@ def random_gaussians(n=300, size=(17, 23), low=0.1, high=1.0, seed=0, corner=(0.
         - 2
         + torch.tensor(corner),
         std=torch.rand(n, 2, generator=rng) * (high - low) + low,
-        rho=torch.rand(n, generator=rng) * 1.98 - 0.99,
+        rho=torch.rand(n, generator=rng) * 1.9 - 0.95,
         color=torch.rand(n, 3, generator=rng),
         opacity=torch.rand(n, generator=rng) * 0.5,
         size=(int(height + corner[1]), int(width + corner[0])),
@@ -103,7 +103,7 @@ def test_a_view_without_pixels_makes_an_empty_picture():
 @pytest.mark.parametrize(
     "extreme",
     [
-        one(std=(1e-6, 1e-6)),  # sampled exactly at its mean
+        one(std=(1e-5, 1e-5)),  # sampled exactly at its mean
         one(std=(1e-6, 1e-6), mean=(1.3, 1.4)),
         one(std=(1e-6, 2.0)),
         one(std=(3.0, 1e-6)),
@@ -243,6 +243,7 @@ def test_records_are_short_for_the_screen_only_where_their_range_suffices(raster
         (usual, "screen", True),
         (usual, "export", False),
         (Gaussians.concatenate([usual, one(std=(1e-5, 1.0))]), "screen", False),
+        (Gaussians.concatenate([usual, one(std=(1.0, 1.0), rho=0.99)]), "screen", False),
         (Gaussians.concatenate([usual, one(std=(1e5, 1e5), opacity=0.1)]), "screen", False),
     ):
         tile = rasterizer.upload(gaussians, quality)

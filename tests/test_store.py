@@ -230,6 +230,8 @@ def test_gaussians_that_reach_far_are_needed_far():
 class FakeScene:
     """A GPU with room for so many tiles."""
 
+    packs = True
+
     def __init__(self, room: int) -> None:
         self.room = room
         self.there: set = set()

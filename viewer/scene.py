@@ -24,6 +24,7 @@ from .source import Source
 from .state import Rectangle
 
 if TYPE_CHECKING:
+    from gsasr.gaussians import Gaussians
     from gsasr.rasterize.gl import GlTile
     from gsasr.rasterize.tiles import PackedTile
 
@@ -142,15 +143,20 @@ class Scene:
         """All that is drawn."""
         return [piece for pieces in self._tiles.values() for piece in pieces]
 
-    def add_tile(self, packed: PackedTile) -> None:
+    @property
+    def packs(self) -> bool:
+        """Once prepared: should tiles come packed, since `add_tile` would do it on the CPU?"""
+        return self._rasterizer.packs
+
+    def add_tile(self, tile: PackedTile | Gaussians) -> None:
         """Add Gaussians of a tile; none is drawn before `cover`. Raises BackendError: no memory."""
-        for _ in self.adding(packed):
+        for _ in self.adding(tile):
             pass
 
-    def adding(self, packed: PackedTile) -> Iterator[None]:
+    def adding(self, tile: PackedTile | Gaussians) -> Iterator[None]:
         """The same in steps of a few milliseconds."""
         self.prepare()
-        self._arriving.append((yield from self._rasterizer.uploading(packed)))
+        self._arriving.append((yield from self._rasterizer.uploading(tile)))
 
     def cover(self, core: Rectangle) -> int:
         """What was added is all of a rectangle: show it where its neighbours' are there, too.

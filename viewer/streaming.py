@@ -79,7 +79,7 @@ class Streaming:
         """On the worker: one tile after another, until there are no more or another task waits."""
         from gsasr.rasterize.gl import pack, split_tiles
 
-        self._worker.show(task, self._scene.prepare)
+        self._worker.carry_out(task, self._prepare())
         try:
             while self._worker.tasks == [task] and (wanted := self._next(tiles)) is not None:
                 index, shown = wanted
@@ -91,13 +91,19 @@ class Streaming:
                 if not held:
                     tiles.keep(index, gaussians, self._camera.view())
                 if shown:
-                    pieces = [pack(piece) for piece in split_tiles(gaussians)]
+                    pieces = split_tiles(gaussians)
+                    if self._scene.packs:
+                        pieces = [pack(piece) for piece in pieces]
                     self._worker.carry_out(task, self._arrive(tiles, index, pieces))
         except Cancelled:
             raise
         except Exception:
             self._worker.show(None, self.stop)  # else it would begin again at once
             raise
+
+    def _prepare(self) -> Generator[None, None, None]:
+        self._scene.prepare()
+        yield
 
     def _arrive(self, tiles: TileStore, index: int, pieces: list) -> Generator[None, None, None]:
         """On the window's thread, over several frames: show a tile, and make room for it."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import moderngl
@@ -19,12 +21,14 @@ class Contestant:
     """A field of Gaussians, ready to be drawn by one rasterizer.
 
     seconds: what making it ready took, by the number of threads.
+    shader_seconds: what shaders take for it, if they can.
     gaussians, index: bytes held of the Gaussians themselves and of lists of them.
     """
 
     name: str
     uses_gl = True
     seconds: dict[int, float]
+    shader_seconds: float | None = None
     gaussians: int
     index: int
 
@@ -49,6 +53,20 @@ class Contestant:
 
     def release(self) -> None:
         """Free what it holds on the GPU."""
+
+
+def gl_seconds(ctx: moderngl.Context, work: Callable[[], object]) -> float:
+    """Of the GPU, by a timer query; on software OpenGL wall time until the work has finished."""
+    if not gl.software(ctx.info):
+        query = ctx.query(time=True)
+        with query:
+            work()
+        return query.elapsed / 1e9
+    ctx.finish()
+    start = time.perf_counter()
+    work()
+    ctx.finish()
+    return time.perf_counter() - start
 
 
 class GlContestant(Contestant):

@@ -18,7 +18,7 @@ from gsasr.rasterize import gl
 from gsasr.rasterize.tiles import PackedTile
 from gsasr.view import View
 
-from .contestant import GlContestant, visits
+from .contestant import GlContestant, gl_seconds, visits
 
 
 class Ours(GlContestant):
@@ -37,6 +37,7 @@ class Ours(GlContestant):
             start = time.perf_counter()
             packed = packed_field(field, threads)
             self.seconds[threads] = time.perf_counter() - start
+        self.shader_seconds = seconds_by_shaders(ctx, field)
         self.tiles = [self.rasterizer.upload(tile) for tile in packed]
         self._levels = {
             id(tile): {level.side: _lists(level) for level in source.levels}
@@ -74,6 +75,21 @@ def packed_field(field: Gaussians, threads: int) -> list[PackedTile]:
     parts = gl.split_tiles(field)
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(gl.pack, parts))
+
+
+def seconds_by_shaders(ctx: moderngl.Context, field: Gaussians) -> float:
+    """What uploading all tiles takes where shaders index them."""
+    rasterizer = gl.GlRasterizer(ctx, index=True)
+    parts = gl.split_tiles(field)
+    rasterizer.upload(parts[0][:1000]).release()  # compiles
+
+    def work() -> None:
+        for part in parts:
+            rasterizer.upload(part).release()
+
+    seconds = gl_seconds(ctx, work)
+    rasterizer.release()
+    return seconds
 
 
 def with_empty_lists(tile: PackedTile) -> PackedTile:

@@ -163,9 +163,10 @@ def _box(mean, std, cut):
             for axis in range(2):
                 reach = math.sqrt(cut[n]) * std[n, axis]
                 start, stop = mean[n, axis] - reach, mean[n, axis] + reach
-                if not start >= low[axis]:  # so that a value that is no number gets into the result
+                # So that a value that is no number gets into the result, and stays there
+                if not (start >= low[axis] or math.isnan(low[axis])):
                     low[axis] = start
-                if not stop <= high[axis]:
+                if not (stop <= high[axis] or math.isnan(high[axis])):
                     high[axis] = stop
     return low, high
 

@@ -19,6 +19,9 @@ from ..errors import BackendError, RequestError
 from ..view import View
 from . import blocks
 from .blocks import HARDWARE, RUN, SOFTWARE, Load, Shape
+from .cells import CELL_SIDES
+from .gl_index import GlIndex
+from .gl_tile import GlLevel, GlTile, allocate
 from .opengl import create_context, driver, hardware, load_shader, software
 from .tiles import PackedTile, pack, split_tiles, visible
 
@@ -47,59 +50,6 @@ HELD = 1 << 29  # bytes of tiles that `render` holds on the GPU at once, about
 
 
 @dataclass(frozen=True)
-class GlLevel:
-    """One index of a tile on the GPU (see cells.Cells)."""
-
-    side: float
-    first: tuple[int, int]
-    shape: tuple[int, int]
-    lists: moderngl.Buffer
-    entries: moderngl.Buffer
-    wide: bool
-    ordinary: int  # entries in ordinary lists, and in steep ones
-    steep: int
-    longest: int
-
-
-@dataclass(frozen=True)
-class GlTile:
-    """A PackedTile on the GPU. `count` Gaussians; the rest as in PackedTile and Records."""
-
-    count: int
-    origin: tuple[int, int]
-    bounds: tuple[float, float, float, float]
-    extent: tuple[float, float, float, float]
-    largest: float
-    records: moderngl.Buffer
-    unpacking: tuple[float, float, float] | None
-    levels: tuple[GlLevel, ...]
-
-    @property
-    def nbytes(self) -> int:
-        """Video memory it holds."""
-        lists = sum(level.lists.size + level.entries.size for level in self.levels)
-        return self.records.size + lists
-
-    def meets(self, view: View) -> bool:
-        """Whether any of it can be seen."""
-        x0, y0 = view.origin
-        x1, y1 = view.to_source(view.size[1], view.size[0])
-        return (
-            self.bounds[0] < x1
-            and x0 < self.bounds[2]
-            and self.bounds[1] < y1
-            and y0 < self.bounds[3]
-        )
-
-    def release(self) -> None:
-        """Free the video memory; on the thread of the context."""
-        self.records.release()
-        for level in self.levels:
-            level.lists.release()
-            level.entries.release()
-
-
-@dataclass(frozen=True)
 class _Variant:
     """Which of the programs made of rasterize.comp."""
 
@@ -122,10 +72,16 @@ class _Runs:
 class GlRasterizer:
     """Draws tiles of Gaussians with a given context, on that context's thread."""
 
-    def __init__(self, ctx: moderngl.Context, shape: Shape | None = None) -> None:
-        """shape: what suits the device (see blocks.Shape), if not what its kind suggests."""
+    def __init__(
+        self, ctx: moderngl.Context, shape: Shape | None = None, index: bool | None = None
+    ) -> None:
+        """shape: what suits the device (see blocks.Shape), if not what its kind suggests.
+        index: whether shaders index Gaussians, if not as its kind suggests (a GPU does).
+        """
         self.ctx = ctx
-        self.shape = shape or (SOFTWARE if software(ctx.info) else HARDWARE)
+        emulated = software(ctx.info)
+        self.shape = shape or (SOFTWARE if emulated else HARDWARE)
+        self._index = GlIndex(ctx) if index or (index is None and not emulated) else None
         self._programs: dict[_Variant, moderngl.ComputeShader] = {}
         self._buffers: dict[tuple[float, int], moderngl.Buffer] = {}
 
@@ -138,7 +94,7 @@ class GlRasterizer:
             pass
 
     def warming(self, dtype: str = "f2") -> Iterator[None]:
-        """The same, one program per step."""
+        """The same, one program of `draw` per step, and those of the index in the last."""
         usual = [_Variant(TARGETS[dtype], block) for block in self.shape.blocks]
         for variant in (*usual, _Variant(TARGETS[dtype], self.shape.steep, steep=True)):
             # No power of two: llvmpipe compiles anew for sides that are none.
@@ -150,37 +106,54 @@ class GlRasterizer:
             self.ctx.finish()
             target.release()
             yield
+        if self._index is not None:
+            self._index.warm_up()
+            yield
 
-    def upload(self, tile: PackedTile | Gaussians, quality: str = "screen") -> GlTile:
-        """The tile on the GPU. Gaussians are packed first, which is better done on a worker.
+    @property
+    def packs(self) -> bool:
+        """Should Gaussians be packed on a worker, since `upload` would do it on the CPU?"""
+        return self._index is None
+
+    def upload(
+        self,
+        tile: PackedTile | Gaussians,
+        quality: str = "screen",
+        sides: tuple[float, ...] = CELL_SIDES,
+    ) -> GlTile:
+        """The tile on the GPU; quality, sides: as in `pack`, of Gaussians that are not yet packed.
 
         Raises BackendError when the GPU has no room for it.
         """
-        steps = self.uploading(tile if isinstance(tile, PackedTile) else pack(tile, quality))
+        steps = self.uploading(tile, quality, sides)
         while True:
             try:
                 next(steps)
             except StopIteration as end:
                 return end.value
 
-    def uploading(self, tile: PackedTile) -> Generator[None, None, GlTile]:
+    def uploading(
+        self,
+        tile: PackedTile | Gaussians,
+        quality: str = "screen",
+        sides: tuple[float, ...] = CELL_SIDES,
+    ) -> Generator[None, None, GlTile]:
         """The same in steps of a few milliseconds, between which frames can be drawn.
 
-        What is there is freed if the steps are not gone through.
+        If they are not gone through, nothing stays on the GPU.
         """
+        if not isinstance(tile, PackedTile):
+            made = self._index.build(tile, quality, sides) if self._index else None
+            if made is not None:
+                return made
+            tile = pack(tile, quality, sides)
         arrays = [tile.records.data, *(a for c in tile.levels for a in (c.lists, c.entries))]
-        buffers: list[moderngl.Buffer] = []
+        buffers = allocate(self.ctx, [array.nbytes for array in arrays])
         try:
-            for array in arrays:
-                # A buffer cannot be empty.
-                buffers.append(self.ctx.buffer(reserve=max(array.nbytes, 32)))
-                if self.ctx.error == "GL_OUT_OF_MEMORY":
-                    raise BackendError(
-                        "The GPU is out of memory; close other programs or use --backend cpu."
-                    )
+            for array, buffer in zip(arrays, buffers, strict=True):
                 data = array.reshape(-1).view(np.uint8)
                 for start in range(0, len(data), STEP):
-                    buffers[-1].write(data[start : start + STEP], offset=start)
+                    buffer.write(data[start : start + STEP], offset=start)
                     yield
         except BaseException:
             for buffer in buffers:
@@ -258,6 +231,8 @@ class GlRasterizer:
             held.release()
         self._programs.clear()
         self._buffers.clear()
+        if self._index is not None:
+            self._index.release()
 
     def _clear(self, target: moderngl.Texture, start: int, stop: int) -> None:
         framebuffer = self.ctx.framebuffer([target])
@@ -372,7 +347,7 @@ def _render(gaussians: Gaussians, view: View, quality: str) -> np.ndarray:
     held: list[GlTile] = []
     try:
         for part in split_tiles(visible(gaussians, view, quality)):
-            held.append(rasterizer.upload(pack(part, quality, sides)))
+            held.append(rasterizer.upload(part, quality, sides))
             if sum(tile.nbytes for tile in held) > HELD:
                 _add(rasterizer, held, view, image)
         _add(rasterizer, held, view, image)

@@ -16,6 +16,7 @@ from .jit import jit
 FOLD = math.sqrt(0.5 * math.log2(math.e))  # exp(-q/2) = 2^-(FOLD^2 q)
 STEPS = (1 << 20) - 1  # of a packed mean across a tile
 FEWEST_STEPS = 100.0  # of a packed mean per standard deviation: 0.3 % of a peak
+FLATTEST = 0.2  # least sqrt(1 - rho^2) that half floats do justice to, where terms cancel
 WIDEST = 4096.0  # standard deviation that half floats hold with all their digits, source pixels
 
 
@@ -47,20 +48,34 @@ def make(
     packed: use the short ones if they hold all of these.
     """
     full = np.zeros((len(rho) + 1, 8), np.float32)
-    narrowest, widest, brightest, farthest = _full(mean, std, rho, peak, full)
-    step = farthest / STEPS
-    fits = FEWEST_STEPS * step <= narrowest and widest <= WIDEST and np.isfinite(brightest)
-    if not (packed and fits and len(rho)):
+    narrowest, flattest, widest, brightest, farthest = _full(mean, std, rho, peak, full)
+    unpacking = unpacking_of(narrowest, flattest, widest, brightest, farthest)
+    if not (packed and unpacking and len(rho)):
         return Records(full, None)
     short = np.empty((len(full), 4), np.uint32)
-    _pack(full, full[:, 2:5].astype(np.float16).view(np.uint16), step, brightest, short)
-    return Records(short, (step, brightest / 4095.0, brightest / 65535.0))
+    _pack(full, full[:, 2:5].astype(np.float16).view(np.uint16), unpacking[0], brightest, short)
+    return Records(short, unpacking)
+
+
+def unpacking_of(
+    narrowest: float, flattest: float, widest: float, brightest: float, farthest: float
+) -> tuple[float, float, float] | None:
+    """Records.unpacking where short records hold such Gaussians, else None.
+
+    narrowest, flattest: least semi-axis and sqrt(1 - rho^2); widest: standard deviation;
+    brightest: of the peaks; farthest: of the means from the tile's origin along an axis.
+    """
+    step = farthest / STEPS
+    shaped = FEWEST_STEPS * step <= narrowest and flattest >= FLATTEST and widest <= WIDEST
+    if shaped and math.isfinite(brightest):
+        return step, brightest / 4095.0, brightest / 65535.0
+    return None
 
 
 @jit
 def _full(mean, std, rho, peak, out):
-    """Fill all but record 0; the least and greatest deviation, peak, and distance along an axis."""
-    narrowest, widest, brightest, farthest = np.inf, 0.0, 1e-9, 1e-9
+    """Fill all but record 0; returns what unpacking_of asks for."""
+    narrowest, flattest, widest, brightest, farthest = np.inf, 1.0, 0.0, 1e-9, 1e-9
     for n in range(rho.shape[0]):
         x, y = std[n, 0], std[n, 1]
         root = math.sqrt(1.0 - rho[n] * rho[n])
@@ -74,9 +89,9 @@ def _full(mean, std, rho, peak, out):
             record[5 + channel] = peak[n, channel]
             brightest = max(brightest, peak[n, channel])
         widest = max(widest, max(x, y))
-        narrowest = min(narrowest, narrow(x, y, root))
+        narrowest, flattest = min(narrowest, narrow(x, y, root)), min(flattest, root)
         farthest = max(farthest, max(mean[n, 0], mean[n, 1]))
-    return narrowest, widest, brightest, farthest
+    return narrowest, flattest, widest, brightest, farthest
 
 
 @jit

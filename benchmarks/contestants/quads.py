@@ -35,16 +35,14 @@ class Quads(GlContestant):
 
     def draw(self, view: View) -> None:
         framebuffer = self.ctx.framebuffer([self.target(view)])
-        framebuffer.use()
         framebuffer.clear(alpha=1.0)
         base, rest = whole_and_rest(view.origin)
         values = {"base": base, "fraction": rest, "scale": view.scale, "size": view.size[::-1]}
         for name, value in values.items():
             self._program[name] = value
-        self.ctx.enable(moderngl.BLEND)
         self.ctx.blend_func = moderngl.ONE, moderngl.ONE
-        self._array.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=len(self._boxes[0]))
-        self.ctx.disable(moderngl.BLEND)
+        with self.ctx.scope(framebuffer, enable_only=moderngl.BLEND):
+            self._array.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=len(self._boxes[0]))
         framebuffer.release()
 
     def evaluations(self, view: View) -> int:

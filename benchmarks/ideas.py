@@ -69,7 +69,7 @@ def variants() -> Iterator[Variant]:
     for block in (2, 4, 6, 8, 10):
         yield Variant(f"blocks of {block}x{block}", blocks=(block,))
     for side in (0.5, 1.0, 2.0, 4.0):
-        yield Variant(f"cells of {side:g}", sides=(side,))
+        yield Variant(f"cells of {side:g}", with_long_lists, sides=(side,))
     yield Variant("records of 32 bytes", lambda: mock.patch.object(records, "WIDEST", 0.0))
     yield Variant("entries of 32 bits", lambda: mock.patch.object(cells, "SHORT", -1))
     yield Variant("an exponential per pixel", lambda: adding("exponentials"))
@@ -77,6 +77,11 @@ def variants() -> Iterator[Variant]:
     yield Variant("weights times colour", lambda: adding("weights"))
     yield Variant("one Gaussian per round", lambda: edited(ROUND, ONE_BY_ONE))
     yield Variant("records from a texture", from_texture, texture=True)
+
+
+def with_long_lists() -> AbstractContextManager:
+    """Else cells of half a pixel would grow until lists are short."""
+    return mock.patch.object(cells, "ENTRIES_PER_GAUSSIAN", 100)
 
 
 ROUND = """        add_entry(base, first, position, offset);

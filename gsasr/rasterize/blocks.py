@@ -35,8 +35,8 @@ class Shape:
 
 # Software runs 8 threads in step and loads for each by itself, so a thread owns as much as it
 # can: measured, benchmarks/NOTES.md. A GPU has few registers per thread; for it, a guess.
-SOFTWARE = Shape((4, 5, 6, 8, 10), 4, (8, 1), 42.0, 2.5)
-HARDWARE = Shape((2, 3, 4), 2, (8, 8), 6.0, 2.5)
+SOFTWARE = Shape((4, 5, 6, 8, 10), 4, (8, 1), 42.0, 5.0)
+HARDWARE = Shape((2, 3, 4), 2, (8, 8), 6.0, 4.0)
 
 
 @dataclass(frozen=True)

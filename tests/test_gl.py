@@ -270,7 +270,7 @@ def test_a_gaussian_takes_at_most_64_bytes_at_16_per_pixel():
 
 
 def test_the_cheapest_cells_and_blocks_grow_with_what_a_pixel_sees():
-    loads = [blocks.Load(1.0, 190, 0), blocks.Load(2.0, 320, 5), blocks.Load(4.0, 700, 300)]
+    loads = [blocks.Load(1.0, 197, 0), blocks.Load(2.0, 301, 26), blocks.Load(4.0, 158, 530)]
     sides, sizes = zip(
         *(blocks.choose(loads, scale, blocks.SOFTWARE) for scale in (1, 2, 6, 8, 10)), strict=True
     )

@@ -65,11 +65,12 @@ def build(
 ) -> list[Cells]:
     """One index per side (source pixels; powers of two, ascending) of the ellipses q <= cut.
 
-    mean, std: (N, 2), source pixels; rho, cut: (N,); a Gaussian with a negative cut is nowhere.
-    The test is exact (ellipse against cell). Where Gaussians are so large or so few that lists or
-    grids would grow out of proportion, the finest cells are larger; at least one index is made.
+    mean, std: (N, 2), source pixels; rho, cut: (N,); all float32. A Gaussian with a negative cut is
+    nowhere. The test is exact (ellipse against cell, in float64). Where Gaussians are so large or
+    so few that lists or grids would grow out of proportion, the finest cells are larger; at least
+    one index is made.
     """
-    mean, std, rho, cut = (np.ascontiguousarray(a, np.float64) for a in (mean, std, rho, cut))
+    mean, std, rho, cut = (np.ascontiguousarray(a, np.float32) for a in (mean, std, rho, cut))
     if not (cut >= 0).any():
         nothing = np.zeros(1, np.uint32), np.zeros(0, np.uint16)
         return [Cells(float(sides[0]), (0, 0), (0, 0), *nothing, 0, 0, 0)]
@@ -102,15 +103,15 @@ def _finest(mean, std, rho, cut, side: float) -> _Spans:
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise FieldError("The Gaussians hold values that are not finite; predict the field anew.")
     most = max(FEW, ENTRIES_PER_GAUSSIAN * len(cut))
-    row, begin = np.zeros(len(cut), np.int32), np.zeros(len(cut) + 1, np.int64)
+    row, begin = np.zeros(len(cut), np.int32), np.zeros(len(cut) + 1, np.int32)
     while True:
         first = np.floor(low / side)
         across, down = np.floor(high / side) - first + 1
         if across * down <= max(FEW, CELLS_PER_GAUSSIAN * len(cut)):
             _rows(mean, std, cut, side, first[1], int(down), row, begin)
             if begin[-1] <= most:
-                columns = np.empty((begin[-1], 2), np.int32)
                 span = int(across)
+                columns = np.empty((begin[-1], 2), np.uint16 if span < 2**16 else np.int32)
                 if _columns(mean, std, rho, cut, side, first, span, row, begin, columns) <= most:
                     corner = (int(first[0]), int(first[1]))
                     return _Spans(side, corner, (int(down), span), row, begin, columns)
@@ -124,32 +125,31 @@ def _merged(fine: _Spans, times: int) -> _Spans:
     shape = -(-(fine.shape[0] + shift[1]) // times), -(-(fine.shape[1] + shift[0]) // times)
     row, begin = np.empty_like(fine.row), np.empty_like(fine.begin)
     columns = np.empty_like(fine.columns)
-    used = _merge(fine.row, fine.begin, fine.columns, *shift, times, row, begin, columns)
-    return _Spans(fine.side * times, first, shape, row, begin, columns[:used].copy())
+    _merge(fine.row, fine.begin, fine.columns, *shift, times, row, begin, columns)
+    return _Spans(fine.side * times, first, shape, row, begin, columns)
 
 
 def _listed(spans: _Spans, steep_from: np.ndarray) -> Cells:
     """The lists of all cells; steep_from: the side of a cell from which each Gaussian is steep."""
-    cells = spans.shape[0] * spans.shape[1]
-    steep = (spans.side > steep_from).astype(np.uint8)
-    counts = np.zeros((cells, 2), np.int32)
-    base, last = np.zeros(cells, np.uint32), np.zeros(cells, np.uint32)
-    where = (spans.row, spans.begin, spans.columns, spans.shape[1], steep)
-    _count(*where, counts, base, last)
-    lists = np.zeros(3 * cells + 1, np.uint32)
-    pairs, longest = _place(counts, base, lists)
-    wide = bool((last - base >= SHORT).any())
-    entries = np.zeros(2 * pairs, np.uint32 if wide else np.uint16)
-    _fill(*where, lists, np.zeros((cells, 2), np.uint32), entries)
-    count, steeps = counts.sum(axis=0, dtype=np.int64)
+    rows, across = spans.shape
+    where = (spans.row, spans.begin, spans.columns, (spans.side > steep_from).astype(np.uint8))
+    changes = np.zeros((rows, across + 1, 2), np.int32)
+    _count(*where, changes)
+    lists = np.zeros(3 * rows * across + 1, np.uint32)
+    pairs, longest, ordinary, steep = _place(changes, lists)
+    for kind, most in ((np.uint16, SHORT), (np.uint32, len(steep_from))):
+        entries = np.zeros(2 * pairs, kind)
+        done = np.zeros((rows * across, 2), np.uint32)
+        if _fill(*where, across, lists, done, entries) <= most:
+            break
     return Cells(
         side=spans.side,
         first=spans.first,
         shape=spans.shape,
         lists=lists,
         entries=entries,
-        count=int(count + steeps),
-        steep=int(steeps),
+        count=ordinary + steep,
+        steep=steep,
         longest=longest,
     )
 
@@ -161,7 +161,7 @@ def _box(mean, std, cut):
     for n in range(cut.shape[0]):
         if cut[n] >= 0.0:
             for axis in range(2):
-                reach = math.sqrt(cut[n]) * std[n, axis]
+                reach = math.sqrt(np.float64(cut[n])) * std[n, axis]
                 start, stop = mean[n, axis] - reach, mean[n, axis] + reach
                 # So that a value that is no number gets into the result, and stays there
                 if not (start >= low[axis] or math.isnan(low[axis])):
@@ -177,7 +177,7 @@ def _rows(mean, std, cut, side, first, down, row, begin):
     for n in range(cut.shape[0]):
         begin[n + 1] = begin[n]
         if cut[n] >= 0.0:
-            reach = std[n, 1] * math.sqrt(cut[n])
+            reach = std[n, 1] * math.sqrt(np.float64(cut[n]))
             start = max(math.floor((mean[n, 1] - reach) / side) - first, 0.0)
             stop = min(math.floor((mean[n, 1] + reach) / side) - first + 1.0, float(down))
             row[n] = int(start)
@@ -197,18 +197,18 @@ def _columns(mean, std, rho, cut, side, first, across, row, begin, columns):
     for n in range(cut.shape[0]):
         if begin[n] == begin[n + 1]:
             continue
-        x, y = mean[n, 0], mean[n, 1]
-        k = math.sqrt(cut[n])
+        x, y, r = np.float64(mean[n, 0]), np.float64(mean[n, 1]), np.float64(rho[n])
+        k = math.sqrt(np.float64(cut[n]))
         reach_x, reach_y = k * std[n, 0], k * std[n, 1]
-        farthest = rho[n] * reach_y
-        root = math.sqrt(1.0 - rho[n] * rho[n])
+        farthest = r * reach_y
+        root = math.sqrt(1.0 - r * r)
         # Lines between rows, from the ellipse's top to its bottom; t = y / (k sy)
-        upper, low, high = -reach_y, -rho[n] * reach_x, -rho[n] * reach_x
+        upper, low, high = -reach_y, -r * reach_x, -r * reach_x
         for j in range(begin[n + 1] - begin[n]):
             lower = min(max((first[1] + row[n] + j + 1) * side - y, -reach_y), reach_y)
             t = lower / reach_y if reach_y > 0.0 else 1.0
             half = reach_x * root * math.sqrt(max(0.0, 1.0 - t * t))
-            middle = rho[n] * reach_x * t
+            middle = r * reach_x * t
             left, right = min(low, middle - half), max(high, middle + half)
             if upper <= farthest <= lower:
                 right = reach_x
@@ -243,54 +243,64 @@ def _merge(row, begin, columns, shift_x, shift_y, times, new_row, new_begin, new
                 used += 1
             previous = here
         new_begin[n + 1] = used
-    return used
 
 
 @jit
 def _steep_from(std, rho, cut):
     """The side of a cell of which half the diagonal is too many standard deviations for STEEP."""
-    side = np.empty(cut.shape[0])
+    side = np.empty(cut.shape[0], np.float32)
     for n in range(cut.shape[0]):
-        least = narrow(std[n, 0], std[n, 1], math.sqrt(1.0 - rho[n] * rho[n]))
-        side[n] = (STEEP - math.sqrt(max(0.0, cut[n]))) * least * math.sqrt(2.0)
+        x, y, r = np.float64(std[n, 0]), np.float64(std[n, 1]), np.float64(rho[n])
+        least = narrow(x, y, math.sqrt(1.0 - r * r))
+        side[n] = (STEEP - math.sqrt(max(0.0, np.float64(cut[n])))) * least * math.sqrt(2.0)
     return side
 
 
 @jit
-def _count(row, begin, columns, across, steep, counts, base, last):
+def _count(row, begin, columns, steep, changes):
+    """By how much the length of each list differs from that of the cell to its left."""
     for n in range(row.shape[0]):
         for j in range(begin[n + 1] - begin[n]):
-            line = (row[n] + j) * across
-            for column in range(columns[begin[n] + j, 0], columns[begin[n] + j, 1]):
-                cell = line + column
-                if counts[cell, 0] + counts[cell, 1] == 0:
-                    base[cell] = n
-                last[cell] = n
-                counts[cell, steep[n]] += 1
+            changes[row[n] + j, columns[begin[n] + j, 0], steep[n]] += 1
+            changes[row[n] + j, columns[begin[n] + j, 1], steep[n]] -= 1
 
 
 @jit
-def _place(counts, base, lists):
-    """Where each list begins; returns how many pairs there are in all and in the longest."""
+def _place(changes, lists):
+    """Where each list begins; returns how many pairs there are in all and in the longest, and how
+    many entries in ordinary and in steep lists."""
     pairs, longest = 0, 0
-    for cell in range(counts.shape[0]):
-        lists[3 * cell + 2] = base[cell]
-        for which in range(2):
-            lists[3 * cell + which] = pairs
-            length = (counts[cell, which] + 1) // 2
-            pairs += length
-            longest = max(longest, length)
-    lists[3 * counts.shape[0]] = pairs
-    return pairs, longest
+    totals = np.zeros(2, np.int64)
+    lengths = np.zeros(2, np.int64)
+    cell = 0
+    for row in range(changes.shape[0]):
+        lengths[:] = 0
+        for column in range(changes.shape[1] - 1):
+            for which in range(2):
+                lengths[which] += changes[row, column, which]
+                totals[which] += lengths[which]
+                lists[3 * cell + which] = pairs
+                length = (lengths[which] + 1) // 2
+                pairs += length
+                longest = max(longest, length)
+            cell += 1
+    lists[3 * cell] = pairs
+    return pairs, longest, totals[0], totals[1]
 
 
 @jit
-def _fill(row, begin, columns, across, steep, lists, done, entries):
+def _fill(row, begin, columns, steep, across, lists, done, entries):
+    """Write entries and bases; returns the greatest entry, which may not have fitted."""
+    greatest = 0
     for n in range(row.shape[0]):
+        which = steep[n]
         for j in range(begin[n + 1] - begin[n]):
             line = (row[n] + j) * across
-            for column in range(columns[begin[n] + j, 0], columns[begin[n] + j, 1]):
-                cell = line + column
-                at = 2 * lists[3 * cell + steep[n]] + done[cell, steep[n]]
-                entries[at] = n - lists[3 * cell + 2] + 1
-                done[cell, steep[n]] += 1
+            for cell in range(line + columns[begin[n] + j, 0], line + columns[begin[n] + j, 1]):
+                if done[cell, 0] + done[cell, 1] == 0:
+                    lists[3 * cell + 2] = n  # the first of the cell, as n ascends
+                entry = n - np.int64(lists[3 * cell + 2]) + 1
+                entries[2 * np.int64(lists[3 * cell + which]) + done[cell, which]] = entry
+                done[cell, which] += 1
+                greatest = max(greatest, entry)
+    return greatest

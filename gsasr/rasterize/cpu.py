@@ -8,16 +8,13 @@ follow a two-multiplication recurrence: g(x+1) = g(x) r(x), r(x+1) = r(x) exp(-1
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..processor import cores
 from .batch import Picture
-from .jit import jit
+from .jit import in_threads, jit, parts
 
 CROWDED = 256  # Gaussians per pixel from which rounding each sum to float32 would add up
 
@@ -34,9 +31,9 @@ def forward(
     for picture in batch:
         own = [array[picture.gaussians] for array in arrays]
         image = pixels[picture.pixels].reshape(*picture.view.size, 3)
-        bands = _runs(picture.view.size[0], image.size * 8 < 1 << 18)
+        bands = parts(picture.view.size[0], image.size * 8 < 1 << 18)
         calls += [(*own, *_geometry(picture), image, start, stop) for start, stop in bands]
-    _run(_forward, calls)
+    in_threads(_forward, calls)
     return torch.from_numpy(pixels.astype(np.float32, copy=False))
 
 
@@ -58,9 +55,9 @@ def backward(
         own = [array[picture.gaussians] for array in arrays]
         image = gradient[picture.pixels].reshape(*picture.view.size, 3)
         out = grads[picture.gaussians]
-        runs = _runs(len(out), len(out) < 4096)
+        runs = parts(len(out), len(out) < 4096)
         calls += [(*own, *_geometry(picture), image, out, start, stop) for start, stop in runs]
-    _run(_backward, calls)
+    in_threads(_backward, calls)
     return torch.from_numpy(grads)
 
 
@@ -191,31 +188,9 @@ def _backward(mean, std, rho, peak, cut, ox, oy, sx, sy, upstream, grads, start,
         grads[n, 7] = sum_blue
 
 
-_pool: ThreadPoolExecutor | None = None
-
-
 def _arrays(*tensors: Tensor) -> list[np.ndarray]:
     return [tensor.detach().contiguous().numpy() for tensor in tensors]
 
 
 def _geometry(picture: Picture) -> tuple[float, float, float, float]:
     return (*picture.view.origin, *picture.view.scale)
-
-
-def _runs(length: int, small: bool) -> list[tuple[int, int]]:
-    """[0, length) cut into parts for the threads; one part if the work is small."""
-    bounds = np.linspace(0, length, (1 if small else 4 * cores()) + 1).astype(np.int64)
-    return [(int(a), int(b)) for a, b in pairwise(bounds) if a < b]
-
-
-def _run(kernel, calls: list[tuple]) -> None:
-    """Call the kernel once per argument tuple, in parallel; it releases the GIL."""
-    global _pool
-    if len(calls) <= 1:
-        for call in calls:
-            kernel(*call)
-        return
-    if _pool is None:
-        _pool = ThreadPoolExecutor(cores(), thread_name_prefix="rasterize")
-    for future in [_pool.submit(kernel, *call) for call in calls]:
-        future.result()

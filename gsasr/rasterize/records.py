@@ -41,14 +41,21 @@ class Records:
 
 
 def make(
-    mean: np.ndarray, std: np.ndarray, rho: np.ndarray, peak: np.ndarray, packed: bool
+    mean: np.ndarray,
+    std: np.ndarray,
+    rho: np.ndarray,
+    peak: np.ndarray,
+    origin: tuple[int, int],
+    packed: bool,
 ) -> Records:
-    """Records of Gaussians; mean (N, 2) relative to the tile, std (N, 2), rho (N,), peak (N, 3).
+    """Records of Gaussians; mean, std (N, 2), rho (N,), peak (N, 3) float32; origin: of the tile.
 
     packed: use the short ones if they hold all of these.
     """
     full = np.zeros((len(rho) + 1, 8), np.float32)
-    narrowest, flattest, widest, brightest, farthest = _full(mean, std, rho, peak, full)
+    narrowest, flattest, widest, brightest, farthest = _full(
+        mean, std, rho, peak, *map(float, origin), full
+    )
     unpacking = unpacking_of(narrowest, flattest, widest, brightest, farthest)
     if not (packed and unpacking and len(rho)):
         return Records(full, None)
@@ -73,24 +80,24 @@ def unpacking_of(
 
 
 @jit
-def _full(mean, std, rho, peak, out):
+def _full(mean, std, rho, peak, x0, y0, out):
     """Fill all but record 0; returns what unpacking_of asks for."""
     narrowest, flattest, widest, brightest, farthest = np.inf, 1.0, 0.0, 1e-9, 1e-9
     for n in range(rho.shape[0]):
-        x, y = std[n, 0], std[n, 1]
-        root = math.sqrt(1.0 - rho[n] * rho[n])
+        x, y, r = np.float64(std[n, 0]), np.float64(std[n, 1]), np.float64(rho[n])
+        root = math.sqrt(1.0 - r * r)
         record = out[n + 1]
-        record[0] = mean[n, 0]
-        record[1] = mean[n, 1]
+        record[0] = mean[n, 0] - x0
+        record[1] = mean[n, 1] - y0
         record[2] = FOLD / (x * root)
-        record[3] = -FOLD * rho[n] / (y * root)
+        record[3] = -FOLD * r / (y * root)
         record[4] = FOLD / y
         for channel in range(3):
             record[5 + channel] = peak[n, channel]
             brightest = max(brightest, peak[n, channel])
         widest = max(widest, max(x, y))
         narrowest, flattest = min(narrowest, narrow(x, y, root)), min(flattest, root)
-        farthest = max(farthest, max(mean[n, 0], mean[n, 1]))
+        farthest = max(farthest, max(record[0], record[1]))
     return narrowest, flattest, widest, brightest, farthest
 
 

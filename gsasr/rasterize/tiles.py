@@ -14,7 +14,7 @@ import numpy as np
 
 from . import cells, records
 from .cells import CELL_SIDES, Cells
-from .jit import jit
+from .jit import in_threads, jit, parts
 from .records import Records
 
 if TYPE_CHECKING:
@@ -54,6 +54,7 @@ def split_tiles(gaussians: Gaussians, side: int = SIDE) -> list[Gaussians]:
 
     At most MOST to a tile, so that its buffers stay below what a driver takes. Within a tile they
     follow the pixels of the source row by row, so that the lists of a cell name near neighbours.
+    Returned on the CPU.
     """
     import torch
 
@@ -69,10 +70,12 @@ def split_tiles(gaussians: Gaussians, side: int = SIDE) -> list[Gaussians]:
     order = np.argsort(inside, kind="stable")
     order = order[np.argsort(number[order], kind="stable")]
     edges = [0, *(np.flatnonzero(np.diff(number[order])) + 1).tolist(), len(order)]
-    # One Gaussian's values lie side by side while they move, which is several times faster.
-    table = torch.cat([t.reshape(len(order), -1) for t in gaussians.tensors().values()], dim=1)
-    table = table.index_select(0, torch.from_numpy(order).to(table.device))
-    mean, std, rho, color, opacity = table.split([2, 2, 1, 3, 1], dim=1)
+    # One Gaussian's values side by side, as a GPU wants them (gl_index.py)
+    table = np.empty((len(order), 9), np.float32)
+    arrays = [_array(tensor) for tensor in gaussians.tensors().values()]
+    calls = [(*arrays, order[a:b], table[a:b]) for a, b in parts(len(order), len(order) < 1 << 16)]
+    in_threads(_gather, calls)
+    mean, std, rho, color, opacity = torch.from_numpy(table).split([2, 2, 1, 3, 1], dim=1)
     ordered = replace(
         gaussians, mean=mean, std=std, rho=rho[:, 0], color=color, opacity=opacity[:, 0]
     )
@@ -95,7 +98,7 @@ def pack(
     from . import footprint
 
     mean = _array(gaussians.mean)
-    std = np.maximum(_array(gaussians.std), THINNEST)
+    std = np.maximum(_array(gaussians.std), np.float32(THINNEST))
     rho = _array(gaussians.rho)
     cut = footprint.cut(gaussians, quality).numpy()
     levels = cells.build(mean, std, rho, cut, sides)
@@ -107,7 +110,7 @@ def pack(
     extent = _extent(mean)
     origin = (math.floor(extent[0]), math.floor(extent[1]))
     peak = _array(gaussians.peak)
-    made = records.make(mean - origin, std, rho, peak, packed=quality == "screen")
+    made = records.make(mean, std, rho, peak, origin, packed=quality == "screen")
     return PackedTile(origin, made, tuple(levels), bounds, extent, float(std.max(initial=0.0)))
 
 
@@ -134,11 +137,22 @@ def _extent(mean: np.ndarray) -> tuple[float, float, float, float]:
 def _places(mean, x0, y0, side, columns, number, inside):
     """The number of the tile that each mean is in, and of the pixel in it, row by row."""
     for n in range(mean.shape[0]):
-        x, y = math.floor(mean[n, 0]) - x0, math.floor(mean[n, 1]) - y0
+        x, y = math.floor(np.float64(mean[n, 0])) - x0, math.floor(np.float64(mean[n, 1])) - y0
         across, down = math.floor(x / side), math.floor(y / side)
         number[n] = down * columns + across
         inside[n] = int((y - down * side) * side + (x - across * side))
 
 
+@jit
+def _gather(mean, std, rho, color, opacity, order, table):
+    for i in range(order.shape[0]):
+        n = order[i]
+        table[i, 0], table[i, 1] = mean[n, 0], mean[n, 1]
+        table[i, 2], table[i, 3] = std[n, 0], std[n, 1]
+        table[i, 4] = rho[n]
+        table[i, 5], table[i, 6], table[i, 7] = color[n, 0], color[n, 1], color[n, 2]
+        table[i, 8] = opacity[n]
+
+
 def _array(tensor) -> np.ndarray:
-    return tensor.detach().cpu().numpy().astype(np.float64)
+    return np.ascontiguousarray(tensor.detach().cpu().numpy(), np.float32)

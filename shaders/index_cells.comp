@@ -41,7 +41,7 @@ void main()
     if (most <= 0.0) return;
 
     float side = float(1 << level), k = sqrt(most);
-    uint steep = (STEEP_FROM - k) * narrow(g) * sqrt(2.0) < side ? 1u : 0u;
+    uint steep = (STEEP_FROM - k) * narrow(g) * STEEP_SIDE < side ? 1u : 0u;
     int columns = GRID >> level;
     vec2 reach = k * g.std, mean = g.mean - origin() + MARGIN;
     float farthest = g.rho * reach.y, thickness = reach.x * root(g.rho);

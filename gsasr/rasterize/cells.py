@@ -20,9 +20,12 @@ ENTRIES_PER_GAUSSIAN = 30  # beyond this (large Gaussians) cells grow, so memory
 CELLS_PER_GAUSSIAN = 4  # likewise for sparse Gaussians
 FEW = 1 << 16  # cells or entries that are fine however few the Gaussians
 SHORT = (1 << 16) - 1  # the greatest entry of 16 bits
-# Standard deviations from the middle of a block of pixels beyond which 2^-(u^2 + v^2) leaves
+# Standard deviations from the middle slot of a block of pixels beyond which 2^-(u^2 + v^2) leaves
 # float32, so that a Gaussian cannot be followed from there: 0.5 log2(e) 12.6^2 = 114.
 STEEP = 12.6
+# The middle slot is at most two thirds of a cell's diagonal from a pixel that it is followed to
+# (where a cell has four pixels a side; with two it would be a whole one: see blocks.THIN).
+STEEP_SIDE = 1.5 / math.sqrt(2.0)
 
 
 @dataclass(frozen=True)
@@ -108,8 +111,7 @@ def _finest(mean, std, rho, cut, side: float) -> _Spans:
         first = np.floor(low / side)
         across, down = np.floor(high / side) - first + 1
         if across * down <= max(FEW, CELLS_PER_GAUSSIAN * len(cut)):
-            _rows(mean, std, cut, side, first[1], int(down), row, begin)
-            if begin[-1] <= most:
+            if _rows(mean, std, cut, side, first[1], int(down), most, row, begin):
                 span = int(across)
                 columns = np.empty((begin[-1], 2), np.uint16 if span < 2**16 else np.int32)
                 if _columns(mean, std, rho, cut, side, first, span, row, begin, columns) <= most:
@@ -172,16 +174,21 @@ def _box(mean, std, cut):
 
 
 @jit
-def _rows(mean, std, cut, side, first, down, row, begin):
-    """The rows of cells that each ellipse meets; (1, 0) if they do not meet."""
+def _rows(mean, std, cut, side, first, down, most, row, begin):
+    """The rows of cells that each ellipse meets; False if they are more than `most` in all."""
+    total = 0
     for n in range(cut.shape[0]):
-        begin[n + 1] = begin[n]
+        begin[n] = total
         if cut[n] >= 0.0:
             reach = std[n, 1] * math.sqrt(np.float64(cut[n]))
             start = max(math.floor((mean[n, 1] - reach) / side) - first, 0.0)
             stop = min(math.floor((mean[n, 1] + reach) / side) - first + 1.0, float(down))
             row[n] = int(start)
-            begin[n + 1] += int(stop) - int(start)
+            total += int(stop) - int(start)
+            if total > most:
+                return False
+    begin[cut.shape[0]] = total
+    return True
 
 
 @jit
@@ -247,12 +254,12 @@ def _merge(row, begin, columns, shift_x, shift_y, times, new_row, new_begin, new
 
 @jit
 def _steep_from(std, rho, cut):
-    """The side of a cell of which half the diagonal is too many standard deviations for STEEP."""
+    """The side of a cell from which the middle slot may be too far away for STEEP."""
     side = np.empty(cut.shape[0], np.float32)
     for n in range(cut.shape[0]):
         x, y, r = np.float64(std[n, 0]), np.float64(std[n, 1]), np.float64(rho[n])
         least = narrow(x, y, math.sqrt(1.0 - r * r))
-        side[n] = (STEEP - math.sqrt(max(0.0, np.float64(cut[n])))) * least * math.sqrt(2.0)
+        side[n] = (STEEP - math.sqrt(max(0.0, np.float64(cut[n])))) * least * STEEP_SIDE
     return side
 
 

@@ -85,6 +85,7 @@ DEFINES = {
     "LARGEST": float(1 << 22),  # area, square source pixels: 32 bits hold it in 256ths
     "FOLD": FOLD,
     "STEEP_FROM": cells.STEEP,
+    "STEEP_SIDE": cells.STEEP_SIDE,
 }
 
 

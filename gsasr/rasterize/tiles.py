@@ -49,10 +49,10 @@ class PackedTile:
         return len(self.records.data) - 1
 
 
-def split_tiles(gaussians: Gaussians, side: int = SIDE) -> list[Gaussians]:
+def split_tiles(gaussians: Gaussians, side: int = SIDE, most: int = MOST) -> list[Gaussians]:
     """The Gaussians by the tile (side x side source pixels, at most 256) that their mean lies in.
 
-    At most MOST to a tile, so that its buffers stay below what a driver takes. Within a tile they
+    At most `most` to a tile, so that its buffers stay below what a driver takes. Within a tile they
     follow the pixels of the source row by row, so that the lists of a cell name near neighbours.
     Returned on the CPU.
     """
@@ -80,9 +80,9 @@ def split_tiles(gaussians: Gaussians, side: int = SIDE) -> list[Gaussians]:
         gaussians, mean=mean, std=std, rho=rho[:, 0], color=color, opacity=opacity[:, 0]
     )
     return [
-        ordered[start : min(start + MOST, stop)]
+        ordered[start : min(start + most, stop)]
         for begin, stop in pairwise(edges)
-        for start in range(begin, stop, MOST)
+        for start in range(begin, stop, most)
     ]
 
 

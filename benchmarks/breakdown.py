@@ -26,7 +26,7 @@ from gl import middle, size
 from measure import machine
 
 from gsasr.processor import cores
-from gsasr.rasterize import blocks, gl
+from gsasr.rasterize import blocks, gl, opengl
 from gsasr.rasterize.tiles import PackedTile
 from gsasr.view import View
 from viewer.scene import Overlay, Scene, Target
@@ -65,7 +65,7 @@ def main() -> None:
     )
     options.add_argument("--frames", type=int, default=9)
     arguments = options.parse_args()
-    ctx = gl.create_context()
+    ctx = opengl.create_context()
     drawn = plane(arguments.side, arguments.side, arguments.per_pixel)
     tiles = packed_field(drawn, cores())
     print(f"{machine()}; OpenGL by {ctx.info['GL_RENDERER']}\n")
@@ -178,7 +178,7 @@ def make_variants(ctx: moderngl.Context, tiles: list[PackedTile]) -> dict[str, V
 @contextmanager
 def without_exponentials() -> Iterator[None]:
     """Shaders compiled inside get something cheap for exp2, which still depends on what it gets."""
-    load = gl.load_shader
+    load = opengl.load_shader
 
     def edited(*arguments) -> str:
         version, rest = load(*arguments).split("\n", 1)

@@ -44,7 +44,7 @@ from gsasr import image
 from gsasr.gaussians import Gaussians
 from gsasr.model import load_model
 from gsasr.prediction import predict
-from gsasr.rasterize import gl
+from gsasr.rasterize.opengl import create_context
 from gsasr.view import View
 
 SLOWEST = 1 / 60  # seconds of a frame that nobody sees
@@ -52,7 +52,7 @@ SLOWEST = 1 / 60  # seconds of a frame that nobody sees
 
 def main() -> None:
     arguments = options().parse_args()
-    ctx = gl.create_context()
+    ctx = create_context()
     report = Report(arguments.out)
     report.line(f"# Frames of {Ours.name} and others, {date.today()}\n")
     report.line(f"{machine()}; OpenGL by {ctx.info['GL_RENDERER']}\n")

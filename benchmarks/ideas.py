@@ -25,7 +25,7 @@ from fields import plane
 from gl import size
 from measure import machine
 
-from gsasr.rasterize import cells, gl, records
+from gsasr.rasterize import cells, gl, opengl, records
 from gsasr.rasterize.blocks import Shape
 from gsasr.rasterize.tiles import PackedTile
 from gsasr.view import View
@@ -54,7 +54,7 @@ def main() -> None:
     options.add_argument("--frames", type=int, default=5)
     options.add_argument("--only", nargs="*", help="parts of the names of variants")
     arguments = options.parse_args()
-    ctx = gl.create_context()
+    ctx = opengl.create_context()
     print(f"{machine()}; OpenGL by {ctx.info['GL_RENDERER']}; {arguments.size[1]}x", end="")
     print(f"{arguments.size[0]}, {arguments.per_pixel} Gaussians per pixel\n")
     for zoom in arguments.zooms:
@@ -108,7 +108,7 @@ def from_texture() -> AbstractContextManager:
 @contextmanager
 def edited(old: str | tuple[str, str], new: str) -> Iterator[None]:
     """Shaders compiled inside have `old` (or all from one text to another) replaced by `new`."""
-    load = gl.load_shader
+    load = opengl.load_shader
 
     def changed(ctx: moderngl.Context, name: str, defines: dict) -> str:
         source = load(ctx, name, defines)

@@ -17,7 +17,7 @@ from fields import plane
 from paths import zoom_and_pan
 from player import Frame, deliver, play, rests, send
 
-from gsasr.rasterize import gl
+from gsasr.rasterize.opengl import create_context
 from viewer.mipmaps import mipmaps
 from viewer.painter import Painter
 from viewer.scene import Scene
@@ -51,7 +51,7 @@ def main() -> None:
     arguments = parser.parse_args()
     canvas, source = arguments.size[::-1], (arguments.source, arguments.source)
 
-    ctx = gl.create_context()
+    ctx = create_context()
     scene = Scene(ctx)
     pixels = np.random.default_rng(0).integers(0, 256, (*source, 4), dtype=np.uint8)
     pixels[..., 3] = 255

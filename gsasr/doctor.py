@@ -70,14 +70,14 @@ def _numba() -> Iterator[Finding]:
 
 
 def _opengl() -> Iterator[Finding]:
-    from .rasterize import driver, gl, opengl
+    from .rasterize import driver, opengl
 
     try:
-        info = gl.driver()
+        info = opengl.driver_info()
     except BackendError as error:
         yield Finding("OpenGL", "none", str(error))
         return
-    software = gl.software(info)
+    software = opengl.software(info)
     kind = "software" if software else "hardware"
     advice = "if this machine has a GPU, install its driver" if software else ""
     yield Finding("OpenGL", f"{info['GL_VERSION']}, {info['GL_RENDERER']} ({kind})", advice)

@@ -14,10 +14,10 @@ from gsasr.errors import BackendError
 @pytest.fixture(scope="session")
 def gl_context():
     """One headless OpenGL context for all tests of the main thread, software or not."""
-    from gsasr.rasterize import gl
+    from gsasr.rasterize.opengl import create_context
 
     try:
-        return gl.create_context()
+        return create_context()
     except BackendError as failure:
         pytest.skip(str(failure))
 

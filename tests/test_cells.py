@@ -140,13 +140,13 @@ def test_degenerate_ellipses_are_indexed_without_overflow():
 def test_the_footprint_of_the_shaders_agrees_with_the_index(gl_context):
     from pathlib import Path
 
-    from gsasr.rasterize import gl, records
+    from gsasr.rasterize import opengl, records
 
     mean, std, rho, cut = random_ellipses(200, seed=1)
     root = np.sqrt(1 - rho**2)
     whitening = [1 / (std[:, 0] * root), -rho / (std[:, 1] * root), 1 / std[:, 1]]
     data = np.stack([*mean.T, *(records.FOLD * w for w in whitening)], axis=1).astype(np.float32)
-    gl.load_shader(gl_context, "rasterize.comp")  # makes gaussian.glsl known
+    opengl.load_shader(gl_context, "rasterize.comp")  # makes gaussian.glsl known
     program = gl_context.compute_shader((Path(__file__).parent / "footprint.comp").read_text())
     (index,) = cells.build(mean, std, rho, cut)
     rows, columns = index.shape

@@ -4,7 +4,7 @@ import pytest
 
 from gsasr import doctor
 from gsasr.errors import BackendError
-from gsasr.rasterize import gl, nvrtc
+from gsasr.rasterize import nvrtc, opengl
 
 
 def findings() -> dict[str, doctor.Finding]:
@@ -32,7 +32,7 @@ def test_what_is_missing_comes_with_advice(monkeypatch):
     def missing(*_):
         raise BackendError("Not here; install it.")
 
-    monkeypatch.setattr(gl, "driver", missing)
+    monkeypatch.setattr(opengl, "driver_info", missing)
     monkeypatch.setattr(nvrtc, "supported", missing)
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
     monkeypatch.setattr("torch.cuda.device_count", lambda: 0)
@@ -59,5 +59,5 @@ def test_the_report_has_a_line_each_and_advice_below(monkeypatch, capsys):
 
 @pytest.mark.parametrize("renderer", ["llvmpipe (LLVM 15)", "softpipe", "SwiftShader Device"])
 def test_software_renderers_are_told_from_hardware(renderer):
-    assert gl.software({"GL_RENDERER": renderer})
-    assert not gl.software({"GL_RENDERER": "NVIDIA H200/PCIe/SSE2"})
+    assert opengl.software({"GL_RENDERER": renderer})
+    assert not opengl.software({"GL_RENDERER": "NVIDIA H200/PCIe/SSE2"})

@@ -371,10 +371,10 @@ def test_a_machine_without_opengl_is_told_what_to_do(monkeypatch):
 
     monkeypatch.setattr(opengl.moderngl, "create_context", refuse)
     with pytest.raises(BackendError, match="--backend cpu"):
-        gl.create_context()
-    gl.hardware.cache_clear(), gl.driver.cache_clear()
-    assert gl.hardware() is False
-    gl.hardware.cache_clear(), gl.driver.cache_clear()
+        opengl.create_context()
+    opengl.hardware.cache_clear(), opengl.driver_info.cache_clear()
+    assert opengl.hardware() is False
+    opengl.hardware.cache_clear(), opengl.driver_info.cache_clear()
 
 
 def test_importing_it_loads_no_torch_and_the_program_ends_cleanly():
@@ -383,8 +383,8 @@ def test_importing_it_loads_no_torch_and_the_program_ends_cleanly():
         "import gsasr.files, pathlib;"
         "root = pathlib.Path(gsasr.files.__file__).parent / 'rasterize';"
         "package.__path__ = [str(root)]; sys.modules['gsasr.rasterize'] = package;"
-        "from gsasr.rasterize import gl; assert 'torch' not in sys.modules;"
-        "gl.hardware(); gl._drawing_thread().submit(gl._headless).result()"
+        "from gsasr.rasterize import gl, opengl; assert 'torch' not in sys.modules;"
+        "opengl.hardware(); gl._drawing_thread().submit(gl._headless).result()"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")

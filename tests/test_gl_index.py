@@ -13,6 +13,7 @@ from gsasr.gaussians import Gaussians
 from gsasr.rasterize import cells, footprint, gl, gl_index, reference, tiles
 from gsasr.rasterize.cells import CELL_SIDES, Cells
 from gsasr.rasterize.gl_index import SLACK, PrefixSum
+from gsasr.rasterize.opengl import software
 from gsasr.view import View
 
 TOLERANCE = {"screen": 1e-3, "export": 1e-4}
@@ -375,9 +376,9 @@ def test_a_tile_leaves_nothing_behind_for_the_next(build):
 
 
 def test_only_a_gpu_indexes_unless_told_otherwise(gl_context, monkeypatch):
-    assert gl.GlRasterizer(gl_context).packs == gl.software(gl_context.info)
-    for software in (False, True):
-        monkeypatch.setattr(gl, "software", lambda _, s=software: s)
-        assert gl.GlRasterizer(gl_context).packs == software
+    assert gl.GlRasterizer(gl_context).packs == software(gl_context.info)
+    for emulated in (False, True):
+        monkeypatch.setattr(gl, "software", lambda _, e=emulated: e)
+        assert gl.GlRasterizer(gl_context).packs == emulated
     assert not gl.GlRasterizer(gl_context, index=True).packs
     assert gl.GlRasterizer(gl_context, index=False).packs

@@ -234,12 +234,12 @@ def test_the_cpu_draws_nothing_of_a_gaussian_that_is_none_and_gives_it_no_gradie
 
 
 def test_auto_draws_by_the_cpu_where_the_kernels_for_a_card_cannot_run(monkeypatch):
-    from gsasr.rasterize import backends, cuda, default_backend, gl
+    from gsasr.rasterize import backends, cuda, default_backend, opengl
 
     def too_old():
         raise BackendError("This card has compute capability 5.0.")
 
-    monkeypatch.setattr(gl, "hardware", lambda: False)
+    monkeypatch.setattr(opengl, "hardware", lambda: False)
     monkeypatch.setattr(cuda, "require", lambda: None)
     assert default_backend() == "cuda"
     monkeypatch.setattr(cuda, "require", too_old)

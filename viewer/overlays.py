@@ -9,7 +9,8 @@ import moderngl
 import numpy as np
 
 from gsasr.errors import RequestError
-from gsasr.rasterize.gl import GlTile, load_shader
+from gsasr.rasterize.gl_tile import GlTile
+from gsasr.rasterize.opengl import load_shader
 from gsasr.rasterize.records import FOLD
 from gsasr.view import View
 

@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _context():
-    from gsasr.rasterize.gl import create_context
+    from gsasr.rasterize.opengl import create_context
 
     try:
         return create_context()

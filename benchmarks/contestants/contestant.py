@@ -11,7 +11,7 @@ import moderngl
 import numpy as np
 
 from gsasr.gaussians import Gaussians
-from gsasr.rasterize import footprint, gl
+from gsasr.rasterize import footprint, opengl, tiles
 from gsasr.view import View
 
 FOLD = math.sqrt(0.5 * math.log2(math.e))  # see shaders/gaussian.glsl
@@ -57,7 +57,7 @@ class Contestant:
 
 def gl_seconds(ctx: moderngl.Context, work: Callable[[], object]) -> float:
     """Of the GPU, by a timer query; on software OpenGL wall time until the work has finished."""
-    if not gl.software(ctx.info):
+    if not opengl.software(ctx.info):
         query = ctx.query(time=True)
         with query:
             work()
@@ -100,7 +100,7 @@ class GlContestant(Contestant):
 
 def shader(ctx: moderngl.Context, name: str, defines: dict[str, object] | None = None) -> str:
     """Source of a shader of this folder, which may include those of shaders/."""
-    gl.load_shader(ctx, "rasterize.comp")  # makes the includes known
+    opengl.load_shader(ctx, "rasterize.comp")  # makes the includes known
     version, rest = Path(__file__).with_name(name).read_text().split("\n", 1)
     lines = [f"#define {key} {value}" for key, value in (defines or {}).items()]
     return "\n".join([version, *lines, rest])
@@ -112,7 +112,7 @@ def drawn(field: Gaussians) -> tuple[np.ndarray, np.ndarray]:
     (N, 8) float32: mean x, y, source pixels; the whitening a, b, c of shaders/gaussian.glsl; the
     peak red, green, blue. (N,) float64: draw where q <= cut, the same that ours draws.
     """
-    parts = gl.split_tiles(field)  # ours cuts by what is in a tile
+    parts = tiles.split_tiles(field)  # ours cuts by what is in a tile
     cut = np.concatenate([footprint.cut(part, "screen").numpy() for part in parts])
     field = Gaussians.concatenate(parts)
     order = np.argsort(field.mean[:, 1].numpy(), kind="stable")

@@ -135,9 +135,9 @@ def require_backend(backend: str) -> None:
 
 def default_backend() -> str:
     """What "auto" means for a picture without gradients: "gl" on a GPU, else "cuda" or "cpu"."""
-    from . import gl
+    from . import opengl
 
-    if gl.hardware():
+    if opengl.hardware():
         return "gl"
     return "cuda" if _cuda_runs() else "cpu"
 

@@ -22,24 +22,13 @@ from .blocks import HARDWARE, RUN, SOFTWARE, Load, Shape
 from .cells import CELL_SIDES
 from .gl_index import GlIndex
 from .gl_tile import GlLevel, GlTile, allocate
-from .opengl import create_context, driver, hardware, load_shader, software
+from .opengl import create_context, load_shader, software
 from .tiles import PackedTile, pack, split_tiles, visible
 
 if TYPE_CHECKING:
     from ..gaussians import Gaussians
 
-__all__ = [
-    "GlRasterizer",
-    "GlTile",
-    "create_context",
-    "driver",
-    "hardware",
-    "load_shader",
-    "pack",
-    "render",
-    "software",
-    "split_tiles",
-]
+__all__ = ["GlRasterizer", "GlTile", "pack", "render", "split_tiles"]
 
 TARGETS = {"f2": "rgba16f", "f4": "rgba32f"}
 BLOCK = 4096  # widest piece that `render` draws at once, pixels

@@ -55,7 +55,7 @@ def ask(question: Callable[[moderngl.Context], T]) -> T:
 
 
 @functools.cache
-def driver() -> dict:
+def driver_info() -> dict:
     """What a headless context says of itself, by OpenGL's names. Raises BackendError if none."""
     return ask(lambda ctx: dict(ctx.info))
 
@@ -69,6 +69,6 @@ def software(info: dict) -> bool:
 def hardware() -> bool:
     """Whether a headless OpenGL 4.3 device is here that is no software renderer. Never raises."""
     try:
-        return not software(driver())
+        return not software(driver_info())
     except BackendError:
         return False

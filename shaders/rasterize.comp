@@ -4,7 +4,7 @@
 // A thread owns a block of BLOCK x BLOCK pixels inside one cell of the tile's index, and loads each
 // Gaussian of the cell once for all of them. Defined by the program that compiles this: BLOCK,
 // THREADS_X x THREADS_Y, TARGET (the format of the picture), PACKED (see records.glsl), WIDE
-// (entries of 32 bits), STEEP (draw the steep lists instead of the ordinary ones).
+// (entries of 32 bits), STEEP (evaluate Gaussians at every pixel instead of following them).
 
 #include "gaussian.glsl"
 #include "records.glsl"
@@ -29,6 +29,7 @@ uniform vec2 grid_corner;   // where that cell begins, source pixels, relative t
 uniform int grid_columns;
 uniform float cell_side;    // source pixels
 uniform vec2 pixel_size;    // source pixels
+uniform ivec2 part;         // where lists of a cell begin and end: ordinary (0, 1), steep (1, 3)
 uniform uvec2 portion;      // of every list the pairs from [0] below [1]: drivers end long loops
 
 const int MIDDLE = BLOCK / 2;  // a run lies round this slot of a block
@@ -130,11 +131,7 @@ void main()
 
     ALL(CLEAR)
     int list = 3 * (cell.y * grid_columns + cell.x);
-#ifdef STEEP
-    uint start = lists[list + 1], end = lists[list + 3];
-#else
-    uint start = lists[list], end = lists[list + 1];
-#endif
+    uint start = lists[list + part[0]], end = lists[list + part[1]];
     uint base = lists[list + 2];
     end = min(end, start + portion[1]);
     for (uint pair = start + portion[0]; pair < end; ++pair) {

@@ -87,6 +87,16 @@ def test_cells_grow_for_huge_gaussians_so_that_memory_stays_bounded():
     assert {0, 1} == set().union(*lists(far).values())
 
 
+def test_more_rows_than_32_bits_count_make_larger_cells():
+    count = 600_000
+    rng = np.random.default_rng(0)
+    mean = rng.uniform(0, 256, (count, 2))
+    std = np.broadcast_to([0.3, 700.0], (count, 2))
+    index = cells.build(mean, std, np.zeros(count), np.full(count, 16.0))[0]
+    assert index.side > 1
+    assert index.count <= cells.ENTRIES_PER_GAUSSIAN * count
+
+
 def test_steep_gaussians_are_listed_apart():
     mean = np.full((2, 2), 0.5)
     std = np.array([[0.5, 0.5], [0.01, 0.5]])

@@ -135,6 +135,22 @@ def test_gaussians_of_every_steepness_agree_with_the_reference(scale):
     assert error(spread, view) < 1e-4
 
 
+@pytest.mark.parametrize("shape", [blocks.SOFTWARE, blocks.HARDWARE], ids=["software", "hardware"])
+@pytest.mark.parametrize("scale", [(0.4, 0.4), (1.05, 1.05), (1.3, 1.3), (1.6, 1.6), (1.3, 13.0)])
+def test_narrow_gaussians_are_right_where_cells_have_few_pixels(gl_context, scale, shape):
+    rng = torch.Generator().manual_seed(2)
+    field = random_gaussians(3000, (24, 24))
+    std = 0.08 + 0.04 * torch.rand(3000, 2, generator=rng)
+    field = Gaussians(**{**field.tensors(), "std": std, "size": field.size})
+    view = View((0.1, 0.2), scale, tuple(int(23 * side) for side in scale[::-1]))
+    rasterizer = gl.GlRasterizer(gl_context, shape)
+    for sides in ((1.0,), (2.0,), (4.0,), (1.0, 2.0, 4.0)):
+        tile = rasterizer.upload(tiles.pack(field, "export", sides))
+        drawn = draw(rasterizer, [tile], view)
+        assert np.abs(drawn - reference.render(field, view).numpy()).max() < 1e-4
+    rasterizer.release()
+
+
 def test_a_deep_zoom_far_from_the_corner_is_exact():
     gaussians = random_gaussians(60, (8, 8), corner=(4000.0, 3000.0))
     for scale in (1000.0, 1e5):
@@ -338,9 +354,8 @@ def test_runs_cover_every_pixel_once_and_stay_inside_a_cell():
         )
 
 
-def test_tiles_never_hold_more_than_the_most(monkeypatch):
-    monkeypatch.setattr(tiles, "MOST", 30)
-    parts = tiles.split_tiles(random_gaussians(200), side=16)
+def test_tiles_never_hold_more_than_the_most():
+    parts = tiles.split_tiles(random_gaussians(200), side=16, most=30)
     assert max(len(part) for part in parts) == 30
     assert sum(len(part) for part in parts) == 200
 

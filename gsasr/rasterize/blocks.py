@@ -16,6 +16,11 @@ from .cells import CELL_SIDES
 RUN = np.dtype([("pixel", "i4"), ("count", "i4"), ("cell", "i4"), ("offset", "f4")])
 
 
+# Pixels along the side of a cell below which Gaussians are not followed from pixel to pixel: where a
+# cell has two, one step is too far for some that are not steep (cells.STEEP_SIDE).
+THIN = 3.0
+
+
 @dataclass(frozen=True)
 class Shape:
     """What suits a kind of device.
@@ -63,9 +68,12 @@ def choose(loads: Iterable[Load], scale: float, shape: Shape) -> tuple[float, in
 
 def _cost(load: Load, block: int, scale: float, shape: Shape) -> float:
     """Per output pixel, in evaluations at one pixel."""
-    cost = load.ordinary * (shape.loading + block**2) * _blocks(load.side * scale, block)
-    steep = shape.loading + shape.steep_cost * shape.steep**2
-    return cost + load.steep * steep * _blocks(load.side * scale, shape.steep)
+    pixels = load.side * scale
+    steep = (shape.loading + shape.steep_cost * shape.steep**2) * _blocks(pixels, shape.steep)
+    if pixels < THIN:
+        return (load.ordinary + load.steep) * steep
+    ordinary = (shape.loading + block**2) * _blocks(pixels, block)
+    return load.ordinary * ordinary + load.steep * steep
 
 
 def _blocks(pixels: float, block: int) -> float:

@@ -50,6 +50,17 @@ class _Variant:
 
 
 @dataclass(frozen=True)
+class _Pass:
+    """A dispatch for a tile: the side of blocks, whether to evaluate at every pixel, which lists of
+    a cell (see rasterize.comp), and the most pairs that these can hold."""
+
+    block: int
+    steep: bool
+    part: tuple[int, int]
+    longest: int
+
+
+@dataclass(frozen=True)
 class _Runs:
     """How a view is cut for one size of cells and of blocks (see blocks.runs)."""
 
@@ -205,13 +216,11 @@ class GlRasterizer:
             return cut[side, block]
 
         for tile, level, block in self._plan([tile for tile in tiles if tile.meets(view)], view):
-            for entries, side, steep in (
-                (level.ordinary, block, False),
-                (level.steep, self.shape.steep, True),
-            ):
-                if entries:
-                    variant = _Variant(kind, side, steep, tile.unpacking is not None, level.wide)
-                    self._draw_tile(variant, tile, level, view, runs(level.side, side))
+            for drawing in _passes(level, block, view, self.shape):
+                packed = tile.unpacking is not None
+                variant = _Variant(kind, drawing.block, drawing.steep, packed, level.wide)
+                by = runs(level.side, drawing.block)
+                self._draw_tile(variant, tile, level, view, by, drawing)
         self.ctx.memory_barrier()
 
     def release(self) -> None:
@@ -254,7 +263,13 @@ class GlRasterizer:
         return _Runs(buffer, columns["cell"], lines["cell"])
 
     def _draw_tile(
-        self, variant: _Variant, tile: GlTile, level: GlLevel, view: View, runs: _Runs
+        self,
+        variant: _Variant,
+        tile: GlTile,
+        level: GlLevel,
+        view: View,
+        runs: _Runs,
+        drawing: _Pass,
     ) -> None:
         x0, x1 = np.searchsorted(runs.columns, (level.first[0], level.first[0] + level.shape[1]))
         y0, y1 = np.searchsorted(runs.lines, (level.first[1], level.first[1] + level.shape[0]))
@@ -280,7 +295,8 @@ class GlRasterizer:
             -(-int(count) // threads)
             for count, threads in zip((x1 - x0, y1 - y0), self.shape.threads, strict=True)
         )
-        for start in range(0, level.longest, PORTION):
+        program["part"] = drawing.part
+        for start in range(0, drawing.longest, PORTION):
             program["portion"] = start, start + PORTION
             program.run(across, down)
             self.ctx.memory_barrier(moderngl.SHADER_IMAGE_ACCESS_BARRIER_BIT)
@@ -298,6 +314,17 @@ class GlRasterizer:
             source = load_shader(self.ctx, "rasterize.comp", defines)
             self._programs[variant] = self.ctx.compute_shader(source)
         return self._programs[variant]
+
+
+def _passes(level: GlLevel, block: int, view: View, shape: Shape) -> Iterator[_Pass]:
+    """Ordinary Gaussians, then steep ones; all as if steep where cells are too small (THIN)."""
+    if level.side * min(view.scale) < blocks.THIN:
+        yield _Pass(shape.steep, True, (0, 3), 2 * level.longest)
+        return
+    if level.ordinary:
+        yield _Pass(block, False, (0, 1), level.longest)
+    if level.steep:
+        yield _Pass(shape.steep, True, (1, 3), level.longest)
 
 
 def _load(levels: list[GlLevel]) -> Load:

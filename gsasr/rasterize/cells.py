@@ -109,14 +109,13 @@ def _finest(mean, std, rho, cut, side: float) -> _Spans:
     row, begin = np.zeros(len(cut), np.int32), np.zeros(len(cut) + 1, np.int32)
     while True:
         first = np.floor(low / side)
-        across, down = np.floor(high / side) - first + 1
-        if across * down <= max(FEW, CELLS_PER_GAUSSIAN * len(cut)):
-            if _rows(mean, std, cut, side, first[1], int(down), most, row, begin):
-                span = int(across)
-                columns = np.empty((begin[-1], 2), np.uint16 if span < 2**16 else np.int32)
-                if _columns(mean, std, rho, cut, side, first, span, row, begin, columns) <= most:
-                    corner = (int(first[0]), int(first[1]))
-                    return _Spans(side, corner, (int(down), span), row, begin, columns)
+        across, down = (int(count) for count in np.floor(high / side) - first + 1)
+        fits = across * down <= max(FEW, CELLS_PER_GAUSSIAN * len(cut))
+        if fits and _rows(mean, std, cut, side, first[1], down, most, row, begin):
+            columns = np.empty((begin[-1], 2), np.uint16 if across < 2**16 else np.int32)
+            if _columns(mean, std, rho, cut, side, first, across, row, begin, columns) <= most:
+                corner = (int(first[0]), int(first[1]))
+                return _Spans(side, corner, (down, across), row, begin, columns)
         side *= 2
 
 

@@ -16,8 +16,8 @@ from .cells import CELL_SIDES
 RUN = np.dtype([("pixel", "i4"), ("count", "i4"), ("cell", "i4"), ("offset", "f4")])
 
 
-# Pixels along the side of a cell below which Gaussians are not followed from pixel to pixel: where a
-# cell has two, one step is too far for some that are not steep (cells.STEEP_SIDE).
+# Pixels along the side of a cell below which Gaussians are not followed from pixel to pixel: where
+# a cell has two, one step is too far for some that are not steep (cells.STEEP_SIDE).
 THIN = 3.0
 
 

@@ -15,8 +15,6 @@ from viewer.painter import Painter
 from viewer.scene import Overlay, Scene
 from viewer.worker import Task, Worker
 
-RESULTS = 0.006  # seconds per frame for what the worker has sent, as in viewer/app.py
-
 
 @dataclass(frozen=True)
 class Frame:
@@ -35,7 +33,7 @@ def play(
     painter: Painter,
     views: list[View],
     fps: float,
-    work: Callable[[], None] = lambda: None,
+    work: Callable[[], object] = lambda: None,
     patience: float = 10.0,
 ) -> list[Frame]:
     """Show each view at its time, as a window at `fps` would; late frames skip views.
@@ -71,18 +69,6 @@ def rests(frames: list[Frame], least: float = 0.2) -> list[tuple[View, float]]:
             ends = [f.start + f.seconds - held[0].start for f in held if f.sharp]
             found.append((held[0].view, min(ends, default=float("inf"))))
     return found
-
-
-def deliver(worker: Worker, scene: Scene, painter: Painter) -> Callable[[], None]:
-    """What the window does at the start of each frame, to give to `play`."""
-
-    def work() -> None:
-        start = time.perf_counter()
-        worker.deliver(RESULTS)
-        if scene.load(start + RESULTS - time.perf_counter()):
-            painter.invalidate()
-
-    return work
 
 
 def send(worker: Worker, scene: Scene, painter: Painter, field: Gaussians) -> Task:

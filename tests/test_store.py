@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from fields import one, random_field
 
-from gsasr.errors import BackendError
+from gsasr.errors import BackendError, CheckpointError, FieldError
 from gsasr.gaussians import Gaussians
 from gsasr.view import View
 from viewer.camera import Camera
 from viewer.state import State
 from viewer.store import TileStore
 from viewer.streaming import Streaming
+from viewer.worker import Worker
 
 SIDE = 100
 COUNT = 50  # Gaussians of a tile
@@ -227,6 +230,15 @@ def test_gaussians_that_reach_far_are_needed_far():
     assert fetch_all(store, at(450), 100 * BYTES, eager=False) == [(4, True), (0, True)]
 
 
+def test_a_tile_in_which_nothing_is_drawn_is_needed_only_where_it_lies():
+    store = TileStore(cores(10), None)
+    for index in range(10):
+        color = (0.0, 0.0, 0.0) if index == 7 else (1.0, 1.0, 1.0)
+        store.keep(index, one((100.0 * index + 50, 50.0), (0.5, 0.5), color=color))
+    assert store.visible(at(50)) == [0]
+    assert store.visible(at(750)) == [7]
+
+
 class FakeScene:
     """A GPU with room for so many tiles."""
 
@@ -236,6 +248,9 @@ class FakeScene:
         self.room = room
         self.there: set = set()
         self.arriving = 0
+
+    def prepare(self) -> None:
+        pass
 
     def adding(self, piece):
         yield
@@ -263,14 +278,100 @@ class FakePainter:
         pass
 
 
-def test_a_full_gpu_makes_the_budget_smaller_and_says_so_and_goes_on():
+class Rig:
+    """A window of 400x400 pixels without OpenGL, that streams the tiles of a store."""
+
+    def __init__(self, store: TileStore, scene: FakeScene) -> None:
+        self.messages: list[str] = []
+        self.worker = Worker(self.messages.append)
+        self.state, self.camera = State(gpu_memory=100 * BYTES), Camera()
+        self.state.document = SimpleNamespace(tiles=store, path=Path("picture.png"))
+        self.streaming = Streaming(
+            self.state, self.camera, self.worker, scene, FakePainter(), self.messages.append
+        )
+        self.camera.resize(400, 400)
+        self.camera.set_picture((SIDE, len(store.cores) * SIDE))
+
+    def frame(self) -> None:
+        self.worker.deliver(0.001)
+        self.streaming.follow()
+        time.sleep(0.001)
+
+    def wait(self, what, act=lambda: time.sleep(0.001)) -> None:
+        """Do `act` until `what()`."""
+        end = time.perf_counter() + 10
+        while not what():
+            assert time.perf_counter() < end, "waited too long"
+            act()
+
+
+@pytest.fixture
+def make_rig():
+    made: list[Rig] = []
+
+    def make(store: TileStore, scene: FakeScene) -> Rig:
+        made.append(Rig(store, scene))
+        return made[-1]
+
+    yield make
+    for rig in made:
+        rig.worker.stop()
+
+
+def test_malformed_gaussians_are_told_once_and_not_fetched_again_before_the_view_moves(make_rig):
+    class Malformed(FakeScene):
+        packs = False  # so Gaussians are packed, and found to be malformed, as they are added
+        tried = 0
+
+        def adding(self, piece):
+            yield
+            self.tried += 1
+            raise FieldError("malformed")
+
+    store, _ = make_store(10)
+    scene = Malformed(room=4)
+    rig = make_rig(store, scene)
+    rig.camera.look_at(50, 50, 4.0)
+    rig.wait(lambda: rig.messages, rig.frame)
+    for _ in range(50):
+        rig.frame()
+    assert rig.messages == ["malformed"] and scene.tried == 1 and not rig.worker.tasks
+    assert not store.any_shown
+    rig.camera.look_at(950, 50, 4.0)
+    rig.wait(lambda: scene.tried == 2, rig.frame)
+
+
+def test_what_failed_is_not_fetched_again_by_a_frame_that_has_not_heard_of_it(make_rig):
+    asked = []
+
+    def fail(index: int):
+        asked.append(index)
+        raise CheckpointError("No.")
+
+    rig = make_rig(TileStore(cores(10), fail, 1 << 30), FakeScene(room=4))
+    rig.streaming.follow()
+    rig.wait(lambda: asked, lambda: rig.worker.deliver(0.001))
+    rig.wait(lambda: not rig.worker.tasks)
+    rig.streaming.follow()  # nothing was delivered meanwhile
+    assert not rig.worker.tasks and len(asked) == 1
+    rig.worker.deliver(1.0)
+    assert rig.messages == ["No."]
+
+
+def test_a_gpu_with_no_room_at_all_is_told_in_a_sentence_that_makes_sense(make_rig):
+    store, _ = make_store(10)
+    rig = make_rig(store, FakeScene(room=0))
+    rig.camera.look_at(50, 50, 4.0)
+    rig.wait(lambda: rig.messages, rig.frame)
+    rig.wait(lambda: store.complete, rig.frame)
+    assert len(rig.messages) == 1 and "no room for any Gaussians" in rig.messages[0]
+
+
+def test_a_full_gpu_makes_the_budget_smaller_and_says_so_and_goes_on(make_rig):
     store, network = make_store(10)
-    scene, messages = FakeScene(room=4), []
-    state, camera = State(gpu_memory=100 * BYTES), Camera()
-    state.document = SimpleNamespace(tiles=store)
-    streaming = Streaming(state, camera, None, scene, FakePainter(), messages.append)
-    camera.resize(400, 400)
-    camera.set_picture((SIDE, 10 * SIDE))
+    scene = FakeScene(room=4)
+    rig = make_rig(store, scene)
+    state, camera, streaming, messages = rig.state, rig.camera, rig.streaming, rig.messages
 
     def work() -> None:
         while (wanted := streaming._next(store)) is not None:

@@ -9,11 +9,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import viewer_scenarios as scenarios
 from conftest import make_tiny_model
 
+from gsasr.errors import RequestError
 from gsasr.model import save_model
+from gsasr.view import View
+from viewer import snapshot
+from viewer.scene import Scene
+from viewer.store import TileStore
 
 pytestmark = pytest.mark.ui
 
@@ -87,6 +93,27 @@ def test_the_gpu_memory_is_given_in_units():
     assert arguments.parse([]).gpu_memory is None
 
 
+@pytest.mark.parametrize("text", ["512", "3T", "2", "1M", "G", "-2G", "1e300G", ""])
+def test_gpu_memory_without_a_unit_or_beyond_sense_is_refused(text):
+    from viewer import arguments
+
+    with pytest.raises(RequestError, match="gpu-memory"):
+        arguments.parse([f"--gpu-memory={text}"])
+
+
+def test_a_snapshot_whose_gaussians_the_gpu_may_not_hold_is_refused(gl_context):
+    scene, field = Scene(gl_context), scenarios.make_field()
+    scene.set_picture(np.zeros((*field.size, 4), np.uint8))
+    tiles = TileStore([(0, 0, field.size[1], field.size[0])])
+    tiles.keep(0, field)
+    view = View.at_scale(field.size, 2.0)
+    snapshot._fill(scene, tiles, view, 1 << 24)
+    assert scene.covers(view)
+    with pytest.raises(RequestError, match="--gpu-memory"):
+        snapshot._fill(scene, tiles, view, sum(tile.nbytes for tile in scene.tiles) - 1)
+    scene.release()
+
+
 def test_a_reset_of_the_driver_ends_in_one_sentence(folder, display, images):
     script = (
         "import sys; from viewer import __main__, app; frames = iter(range(10**6));"
@@ -121,8 +148,7 @@ def test_without_a_display_it_names_the_way_without_one(images):
         (["missing.safetensors"], "missing.safetensors does not exist"),
         (["."], "is a folder"),
         (["--size", "12"], "--size"),
-        (["--gpu-memory", "2"], "--gpu-memory"),
-        (["--gpu-memory", "1M"], "--gpu-memory"),
+        (["--gpu-memory", "512"], "--gpu-memory"),
         (["--zoom", "-1", "--snapshot", "out.png"], "--zoom"),
         (["--snapshot", "out.png"], "picture"),
         (["--no-such-option"], "--no-such-option"),

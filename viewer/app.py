@@ -27,12 +27,12 @@ from .file_dialogs import OpenDialog, SaveDialog, has_native
 from .memory_dialog import MemoryDialog
 from .scene import Scene
 from .session import Session
+from .streaming import deliver
 
 TITLE = "GSASR"
 # Frames per second without input, which is handled at once in any case, as are results of the
 # worker. Hello ImGui waits for so long; 0 would mean that it does not wait at all.
 BUSY_FPS, IDLE_FPS = 10.0, 0.001
-RESULTS = 0.006  # seconds per frame for what the worker has sent, and for uploading the picture
 LOST = (
     "The graphics driver was reset, and all that was on the GPU is gone; "
     "nothing unsaved is lost, so open the picture again."
@@ -82,12 +82,8 @@ class App:
             self.lost = True  # there is nothing left to draw with, not even a message
             hello_imgui.get_runner_params().app_shall_exit = True
             return
-        if session.worker.deliver(RESULTS):
+        if deliver(session.worker, session.scene, session.painter):
             hello_imgui.request_refresh()
-        if session.scene.loading:
-            hello_imgui.request_refresh()
-            if session.scene.load(start + RESULTS - time.perf_counter()):
-                session.painter.invalidate()
         spent = time.perf_counter() - start
         menu.handle_keys(session)
         menu.draw(session)

@@ -76,11 +76,13 @@ def _number(text: str) -> float:
 
 
 def _bytes(text: str) -> int:
-    units = {"M": 1 << 20, "G": 1 << 30}
-    size = int(_number(text[:-1]) * units[text[-1:].upper()])
-    if size < LEAST_MEMORY:
+    unit = {"M": 1 << 20, "G": 1 << 30}.get(text[-1:].upper())
+    if unit is None:
         raise ValueError
-    return size
+    size = _number(text[:-1]) * unit
+    if not LEAST_MEMORY <= size < math.inf:
+        raise ValueError
+    return int(size)
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -72,8 +72,13 @@ class Loader:
         model = field.model or "saved field"
         return Document(path, to_rgba(color, None), None, tiles, model, field.scale)
 
-    def plan(self, task: Task, document: Document, model_name: str, condition: float) -> TileStore:
-        """The tiles of a picture, none of them predicted yet. Raises CheckpointError."""
+    def plan(
+        self, task: Task, document: Document, model_name: str, condition: float
+    ) -> tuple[TileStore, str]:
+        """The tiles of a picture, none of them predicted yet, and the name of what will.
+
+        Raises CheckpointError.
+        """
         task.progress(None, "Loading the network")
         _load_torch()
         model = self._load(model_name)
@@ -82,12 +87,12 @@ class Loader:
 
         image = document.picture.color
         check(image, condition)
-        document.model, document.condition = model.name, condition
         tiles = plan(model, document.size, TILE)
-        return TileStore(
+        store = TileStore(
             [(tile.x0, tile.y0, tile.x1, tile.y1) for tile in tiles],
             lambda index: predict_tile(model, image, tiles[index], condition),
         )
+        return store, model.name
 
     def _load(self, name: str) -> GSASR:
         import torch

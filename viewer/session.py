@@ -43,7 +43,7 @@ class Session:
         self.streaming: Streaming | None = None
         self.quitting = False
         self._loader = loading.Loader()
-        self._gpu_memory = gpu_memory
+        self._gpu_memory = gpu_memory  # state.gpu_memory is less once the GPU was full
 
     def start(self, scene: Scene) -> None:
         """There is an OpenGL context now."""
@@ -53,7 +53,8 @@ class Session:
         self.streaming = Streaming(
             self.state, self.camera, self.worker, scene, self.painter, self.fail
         )
-        self.state.gpu_memory = self._gpu_memory or video_memory(scene.ctx).budget
+        self._gpu_memory = self._gpu_memory or video_memory(scene.ctx).budget
+        self.state.gpu_memory = self._gpu_memory
 
     # Documents
 
@@ -103,8 +104,12 @@ class Session:
 
             tiles = document.tiles
             require_field(tiles.count)
-            parts = [tiles.gaussians(index) for index in range(len(tiles.cores))]
+            parts = []
+            for index in range(len(tiles.cores)):
+                task.check()
+                parts.append(tiles.gaussians(index))
             field = Gaussians.concatenate(parts)
+            task.check()
             replace(field, source=document.path.name).save(path)
             self.worker.show(task, lambda: self.note(f"Saved {path}"))
 
@@ -170,7 +175,7 @@ class Session:
 
     def set_gpu_memory(self, size: int) -> None:
         """Let the GPU hold so many bytes of Gaussians."""
-        self.state.gpu_memory = max(LEAST_MEMORY, size)
+        self.state.gpu_memory = self._gpu_memory = max(LEAST_MEMORY, size)
         self.streaming.make_room()
 
     def toggle_dialog(self, name: str) -> None:
@@ -213,15 +218,20 @@ class Session:
         self.camera.set_picture(document.size)
         self.painter.reset()
         self.state.message = None
-        self.streaming.restart()
         self.state.document = document
+        self._stream()
 
     def _plan(self, task: Task, document: Document, model: str, condition: float) -> None:
         """On the worker: have the tiles of a picture predicted from now on."""
-        tiles = self._loader.plan(task, document, model, condition)
+        tiles, name = self._loader.plan(task, document, model, condition)
 
         def begin() -> None:
-            document.tiles = tiles
-            self.streaming.restart()
+            document.tiles, document.model, document.condition = tiles, name, condition
+            self._stream()
 
         self.worker.show(task, begin)
+
+    def _stream(self) -> None:
+        """There are other tiles: fetch them, and try again all the room that the GPU may have."""
+        self.state.gpu_memory = self._gpu_memory
+        self.streaming.restart()

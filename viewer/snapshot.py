@@ -35,8 +35,10 @@ def run(options: argparse.Namespace) -> None:
     scene.set_picture(document.pixels)
     if view.scale[0] > 1 or options.overlay != "none":
         if document.tiles is None:
-            document.tiles = loader.plan(task, document, options.model, options.condition)
-        _fill(scene, document.tiles, view)
+            document.tiles, _ = loader.plan(task, document, options.model, options.condition)
+        from gsasr.rasterize.driver import video_memory
+
+        _fill(scene, document.tiles, view, options.gpu_memory or video_memory(scene.ctx).budget)
     height, width = view.size
     target = Target(scene.ctx, (height, width))
     scene.draw(target, view, Overlay(options.overlay, options.sigma))
@@ -70,12 +72,20 @@ def _camera(options: argparse.Namespace, document: Document) -> Camera:
     return camera
 
 
-def _fill(scene: Scene, tiles: TileStore, view: View) -> None:
-    """Have the scene draw the tiles of a view, with a progress bar where somebody may watch it."""
+def _fill(scene: Scene, tiles: TileStore, view: View, memory: int) -> None:
+    """Have the scene draw the tiles of a view, with a progress bar where somebody may watch it.
+
+    memory: bytes that they may take on the GPU. Raises RequestError if they take more.
+    """
     from gsasr.rasterize.gl import pack, split_tiles
 
-    visible = tiles.visible(view)
+    visible, held = tiles.visible(view), 0
     for index in tqdm(visible, "Gaussians", disable=None, bar_format="{l_bar}{bar}"):
         for piece in split_tiles(tiles.gaussians(index)):
             scene.add_tile(pack(piece))
-        scene.cover(tiles.cores[index])
+        held += scene.cover(tiles.cores[index])
+        if held > memory:
+            raise RequestError(
+                f"The view shows more Gaussians than the {memory / 2**20:.0f} MiB for them on the "
+                "GPU can hold; raise --gpu-memory, --zoom in further, or use gsasr upscale."
+            )

@@ -140,7 +140,7 @@ class TileStore:
         coded = encode(gaussians)
         bounds = np.array(footprint.bounds(gaussians, "export"))
         reach = self._reach[index]
-        if len(gaussians):
+        if bounds.any():  # else nothing is drawn
             reach[:2], reach[2:] = np.fmin(reach[:2], bounds[:2]), np.fmax(reach[2:], bounds[2:])
         self._coded_size.learn(index, coded.nbytes)
         self._coded[index], self._held[index], self._count[index] = coded, True, len(coded)

@@ -7,9 +7,10 @@ window's thread uploads it, and takes off the GPU what is beyond its budget.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Generator
 
-from gsasr.errors import BackendError, Cancelled
+from gsasr.errors import BackendError, Cancelled, GsasrError
 from gsasr.view import View
 
 from .camera import Camera
@@ -20,7 +21,20 @@ from .state import Document, Rectangle, State
 from .store import TileStore
 from .worker import Task, Worker
 
+RESULTS = 0.006  # seconds per frame for what the worker has sent, and for uploading the picture
 ROOM = 0.9  # of what the GPU held when it was full that it may hold from then on
+
+
+def deliver(worker: Worker, scene: Scene, painter: Painter) -> bool:
+    """At the start of a frame: take what the worker has sent, then upload more of the picture.
+
+    True if another frame should follow at once.
+    """
+    start = time.perf_counter()
+    ran, loading = worker.deliver(RESULTS), scene.loading
+    if loading and scene.load(start + RESULTS - time.perf_counter()):
+        painter.invalidate()
+    return ran or loading
 
 
 class Streaming:
@@ -45,7 +59,7 @@ class Streaming:
         self._stopped = None
 
     def stop(self) -> None:
-        """Fetch nothing until the view moves, and from then on only what it needs."""
+        """Fetch nothing until the view moves, and from then on only what it needs. Any thread."""
         self._stopped = self._camera.view()
 
     def follow(self) -> None:
@@ -98,7 +112,7 @@ class Streaming:
         except Cancelled:
             raise
         except Exception:
-            self._worker.show(None, self.stop)  # else it would begin again at once
+            self.stop()  # before the task is gone, else the next frame would begin it again
             raise
 
     def _prepare(self) -> Generator[None, None, None]:
@@ -119,10 +133,14 @@ class Streaming:
         except BackendError:
             held = tiles.shown_bytes
             self._state.gpu_memory = int(ROOM * held)
+            most = f"more than {held / 2**20:.1f} MiB of" if held else "any"
             self._fail(
-                f"The GPU has no room for more than {held / 2**20:.0f} MiB of Gaussians; "
+                f"The GPU has no room for {most} Gaussians; "
                 "what does not fit shows as the source picture."
             )
+        except GsasrError:  # malformed Gaussians; the worker tells, and ends the task
+            self.stop()
+            raise
         finally:
             self._scene.drop_arriving()
         self.make_room()

@@ -88,7 +88,8 @@ class Worker:
     def carry_out(self, task: Task, steps: Generator[None, None, None]) -> None:
         """From the work: have the window's thread go through `steps`, over several frames.
 
-        Returns at their end. Raises Cancelled if the task is; the steps are then closed.
+        Returns at their end. Raises Cancelled if the task is, at once; the window's thread closes
+        the steps only later, at its next `deliver`.
         """
         result = Result(task, steps)
         self._put(result)

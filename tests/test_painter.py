@@ -193,10 +193,31 @@ def test_painter_draws_again_only_what_arrived(scene):
         painter.paint(view, Overlay())
     painter.invalidate((-50, -10))
     assert not painter.busy
+    before = shown(painter)
     field = make_field()
     add(scene, field)
-    painter.invalidate((-50, 1000))
+    painter.invalidate((100, 150))
     assert painter.busy
     while painter.busy:
         painter.paint(view, Overlay())
-    assert_shows((painter.target.read() / 255).astype(np.float32), field, view)
+    after, wanted = shown(painter), show(scene, view).astype(np.float32)
+    assert np.array_equal(after[100:150], wanted[100:150])
+    for untouched in (slice(0, 100), slice(150, 300)):
+        assert np.array_equal(after[untouched], before[untouched])
+        assert np.abs(after[untouched] - wanted[untouched]).max() > 0.1
+    painter.invalidate((-50, 1000))
+    while painter.busy:
+        painter.paint(view, Overlay())
+    assert_shows(shown(painter), field, view)
+
+
+def test_how_much_there_is_to_draw_is_counted_once_per_view_and_change_of_tiles(scene):
+    scene.set_picture(random_picture())
+    near, far = View((0, 0), (10.0, 10.0), (300, 400)), View((500, 0), (10.0, 10.0), (300, 400))
+    assert scene.work(near).sum() == 0
+    add(scene, make_field())
+    counted = scene.work(near)
+    assert scene.work(near) is counted and counted.min() >= 400
+    assert scene.work(far).sum() == 0
+    scene.clear_tiles()
+    assert scene.work(near).sum() == 0

@@ -25,7 +25,9 @@ class Coverage:
         self.span = (columns * BLOCK, rows * BLOCK)  # source pixels, (x, y)
         self.texture = ctx.texture((columns, rows), 1, bytes(rows * columns), alignment=1)
         self.texture.repeat_x = self.texture.repeat_y = False
-        self._arrived = np.zeros((rows, columns), bool)
+        # Beyond the picture there is nothing to wait for.
+        self._around = np.pad(np.zeros((rows, columns), bool), EDGE, constant_values=True)
+        self._arrived = self._around[EDGE : EDGE + rows, EDGE : EDGE + columns]
         self._complete = np.zeros((rows, columns), bool)
 
     def add(self, core: Rectangle) -> None:
@@ -64,9 +66,7 @@ class Coverage:
         right, bottom = min(columns, x1 + EDGE), min(rows, y1 + EDGE)
         if left >= right or top >= bottom:
             return
-        around = np.pad(self._arrived, EDGE, constant_values=True)[
-            top : bottom + 2 * EDGE, left : right + 2 * EDGE
-        ]
+        around = self._around[top : bottom + 2 * EDGE, left : right + 2 * EDGE]
         windows = np.lib.stride_tricks.sliding_window_view(around, (2 * EDGE + 1,) * 2)
         complete = self._complete[top:bottom, left:right] = windows.all((2, 3))
         self.texture.write(

@@ -57,8 +57,8 @@ class Painter:
         self.budget = SOFTWARE_BUDGET if self._clock.software else BUDGET
         self._small: Target | None = None
         self._shown: tuple[View, Overlay] | None = None
-        self._drawn = 0
-        self._stale = (0, 0)  # of the drawn rows, those that are not exact or out of date
+        self._drawn = 0  # rows of the target, from its top
+        self._stale = (0, 0)  # of those, the rows [first, last) not exact or out of date
         self._changed = -math.inf  # when the view did
         slower = SLOWER if self._clock.software else 1
         self._gaussians = Rates(GAUSSIANS * slower)  # per pixel and tile that lies there

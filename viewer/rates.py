@@ -28,7 +28,7 @@ class Rates:
         return seconds * max(1.0, known / scale) ** 2
 
     def learn(self, scale: float, seconds: float) -> None:
-        """A pixel took so many seconds at a scale."""
+        """A pixel took so many seconds at a scale (output pixels per source pixel)."""
         octave = _octave(scale)
         if octave in self._known:
             expected = self.predict(scale)

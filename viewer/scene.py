@@ -78,6 +78,8 @@ class Scene:
         self._source: Source | None = None
         self._coverage: Coverage | None = None
         self._field: moderngl.Texture | None = None
+        self._work = np.zeros(0)
+        self._work_of: tuple | None = None  # the view and tiles that it is of
         self._marks: Target | None = None
         self._marks_of: tuple | None = None  # the view, overlay and tiles that they show
         self._arrays: dict[tuple[bool, ...], moderngl.VertexArray] = {}
@@ -230,6 +232,8 @@ class Scene:
 
     def work(self, view: View) -> np.ndarray:
         """(h,) of each output row, the pixels on which tiles of Gaussians lie."""
+        if self._work_of == (view, self._changes):
+            return self._work
         height, width = view.size
         rows = np.zeros(height)
         for tile in self.tiles:
@@ -239,6 +243,7 @@ class Scene:
             start, stop = max(math.floor(y0), 0), min(math.ceil(y1), height)
             if columns > 0 and start < stop:
                 rows[start:stop] += columns
+        self._work, self._work_of = rows, (view, self._changes)
         return rows
 
     def marked(self, view: View, overlay: Overlay) -> bool:

@@ -15,7 +15,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from unittest import mock
 
@@ -26,7 +26,6 @@ from gl import size
 from measure import machine
 
 from gsasr.rasterize import cells, gl, opengl, records
-from gsasr.rasterize.blocks import Shape
 from gsasr.rasterize.tiles import PackedTile
 from gsasr.view import View
 
@@ -163,11 +162,9 @@ class Drawing:
 
     def __init__(self, ctx, variant: Variant, parts, view: View, target) -> None:
         self.view, self.target, self.seconds = view, target, []
-        usual = gl.GlRasterizer(ctx).shape
-        sides = variant.blocks or usual.blocks
-        self.rasterizer = gl.GlRasterizer(
-            ctx, Shape(sides, usual.steep, usual.threads, usual.loading, usual.steep_cost)
-        )
+        self.rasterizer = gl.GlRasterizer(ctx)
+        if variant.blocks is not None:
+            self.rasterizer.shape = replace(self.rasterizer.shape, blocks=variant.blocks)
         with variant.patched():
             packed: list[PackedTile] = [gl.pack(part, sides=variant.sides) for part in parts]
             self.tiles = [self.rasterizer.upload(tile) for tile in packed]

@@ -309,7 +309,7 @@ def test_pictures_larger_than_a_piece_agree_with_the_reference(monkeypatch):
 
 def test_fields_larger_than_what_is_held_at_once_agree_with_the_reference(monkeypatch):
     monkeypatch.setattr(gl, "HELD", 1)
-    monkeypatch.setattr(gl, "split_tiles", lambda gaussians: tiles.split_tiles(gaussians, 8))
+    monkeypatch.setattr(gl, "split_tiles", lambda gaussians, most: tiles.split_tiles(gaussians, 8))
     gaussians = random_gaussians()
     assert error(gaussians, View((-1.0, -1.0), (7.7, 7.7), (131, 150))) < 1e-4
 

@@ -217,7 +217,8 @@ def test_a_large_picture_is_shown_coarsely_at_once_and_exactly_in_the_end(scene)
 
 
 def test_a_picture_beyond_the_largest_texture_is_averaged(gl_context):
-    small = SimpleNamespace(info={"GL_MAX_TEXTURE_SIZE": 100}, texture=gl_context.texture)
+    info = {"GL_MAX_TEXTURE_SIZE": 100}
+    small = SimpleNamespace(info=info, texture=gl_context.texture, error="GL_NO_ERROR")
     pixels = random_picture((150, 180))
     source = Source(small, mipmaps(pixels))
     source.load(math.inf)

@@ -9,6 +9,9 @@ from dataclasses import dataclass
 import moderngl
 import numpy as np
 
+from gsasr.errors import BackendError
+from gsasr.rasterize.opengl import with_room
+
 from .mipmaps import Mipmaps
 
 BAND = 1 << 20  # bytes uploaded at once
@@ -26,7 +29,8 @@ class Source:
     """A picture that is there at once, coarsely, and in full after some calls of `load`.
 
     Levels have a texture each, so that those that have arrived can be shown while the next one
-    is on its way. A level too large for a texture is left out.
+    is on its way. A level too large for a texture is left out. Raises BackendError if the GPU has
+    no room.
     """
 
     def __init__(self, ctx: moderngl.Context, mipmaps: Mipmaps) -> None:
@@ -43,8 +47,12 @@ class Source:
         self._arrived: dict[int, Level] = {}
         self._arriving: moderngl.Texture | None = None
         self._rows = 0  # of it that are there
-        while self._waiting and self._waiting[-1][1].nbytes <= BAND:
-            self.load(0.0)
+        try:
+            while self._waiting and self._waiting[-1][1].nbytes <= BAND:
+                self.load(0.0)
+        except BackendError:
+            self.release()
+            raise
 
     @property
     def loading(self) -> bool:
@@ -57,10 +65,18 @@ class Source:
         return min(self._arrived)
 
     def load(self, seconds: float) -> bool:
-        """Upload for about so long, at least one band; True if there is a finer level now."""
+        """Upload for about so long, at least one band; True if there is a finer level now.
+
+        Raises BackendError if the GPU has no room for more: then the levels that have arrived stay,
+        and no others are waited for.
+        """
         deadline, finer, first = time.perf_counter() + seconds, False, True
         while self._waiting and (first or time.perf_counter() < deadline):
-            finer = self._upload_band() or finer
+            try:
+                finer = self._upload_band() or finer
+            except BackendError:
+                self._give_up()
+                raise
             first = False
         return finer
 
@@ -77,22 +93,29 @@ class Source:
         """Free the textures."""
         for level in self._arrived.values():
             level.texture.release()
+        self._give_up()
+
+    def _give_up(self) -> None:
+        """Wait for no more levels."""
+        self._waiting.clear()
         if self._arriving is not None:
             self._arriving.release()
+            self._arriving = None
 
     def _upload_band(self) -> bool:
         """Some more rows; True if a level is complete now."""
         number, pixels = self._waiting[-1]
         height, width = pixels.shape[:2]
         if self._arriving is None:
-            self._arriving = self._ctx.texture((width, height), 4)
+            self._arriving = with_room(self._ctx, self._ctx.texture, (width, height), 4)
             self._arriving.filter = (moderngl.LINEAR, moderngl.LINEAR)
             self._arriving.repeat_x = self._arriving.repeat_y = False
             self._rows = 0
         start = self._rows
         stop = min(height, start + max(1, BAND // (4 * width)))
         rows = np.ascontiguousarray(pixels[start:stop])
-        self._arriving.write(rows, viewport=(0, start, width, stop - start), alignment=4)
+        place = (0, start, width, stop - start)
+        with_room(self._ctx, self._arriving.write, rows, viewport=place, alignment=4)
         self._rows = stop
         if stop < height:
             return False

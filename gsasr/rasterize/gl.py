@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING
 import moderngl
 import numpy as np
 
-from ..errors import BackendError, RequestError
+from ..errors import RequestError
 from ..view import View
 from . import blocks
 from .blocks import HARDWARE, RUN, SOFTWARE, Load, Shape
-from .cells import CELL_SIDES
+from .cells import CELL_SIDES, ENTRIES_PER_GAUSSIAN
 from .gl_index import GlIndex
 from .gl_tile import GlLevel, GlTile, allocate
-from .opengl import create_context, load_shader, software
-from .tiles import PackedTile, pack, split_tiles, visible
+from .opengl import create_context, load_shader, software, storage_limit, with_room
+from .tiles import MOST, PackedTile, pack, split_tiles, visible
 
 if TYPE_CHECKING:
     from ..gaussians import Gaussians
@@ -98,7 +98,7 @@ class GlRasterizer:
         usual = [_Variant(TARGETS[dtype], block) for block in self.shape.blocks]
         for variant in (*usual, _Variant(TARGETS[dtype], self.shape.steep, steep=True)):
             # No power of two: llvmpipe compiles anew for sides that are none.
-            target = self.ctx.texture((3, 3), 4, dtype=dtype)
+            target = with_room(self.ctx, self.ctx.texture, (3, 3), 4, dtype=dtype)
             target.bind_to_image(0, read=True, write=True)
             program = self._program(variant)
             program["window"] = 0, 0, 0, 0  # no runs: every thread ends at once
@@ -115,6 +115,11 @@ class GlRasterizer:
         """Should Gaussians be packed on a worker, since `upload` would do it on the CPU?"""
         return self._index is None
 
+    @property
+    def most(self) -> int:
+        """Gaussians of a tile, at most (see split_tiles): the driver takes no larger buffers."""
+        return min(MOST, storage_limit(self.ctx) // (4 * ENTRIES_PER_GAUSSIAN))
+
     def upload(
         self,
         tile: PackedTile | Gaussians,
@@ -123,7 +128,7 @@ class GlRasterizer:
     ) -> GlTile:
         """The tile on the GPU; quality, sides: as in `pack`, of Gaussians that are not yet packed.
 
-        Raises BackendError when the GPU has no room for it.
+        Raises BackendError when the GPU has no room for it, or takes no buffers so large.
         """
         steps = self.uploading(tile, quality, sides)
         while True:
@@ -153,7 +158,7 @@ class GlRasterizer:
             for array, buffer in zip(arrays, buffers, strict=True):
                 data = array.reshape(-1).view(np.uint8)
                 for start in range(0, len(data), STEP):
-                    buffer.write(data[start : start + STEP], offset=start)
+                    with_room(self.ctx, buffer.write, data[start : start + STEP], offset=start)
                     yield
         except BaseException:
             for buffer in buffers:
@@ -254,10 +259,10 @@ class GlRasterizer:
         data = np.concatenate([columns, lines])
         buffer = self._buffers.get((side, block))
         if buffer is None or buffer.size < data.nbytes:
+            (larger,) = allocate(self.ctx, [2 * max(data.nbytes, RUN.itemsize)])
             if buffer is not None:
                 buffer.release()
-            buffer = self.ctx.buffer(reserve=2 * max(data.nbytes, RUN.itemsize))
-            self._buffers[side, block] = buffer
+            buffer = self._buffers[side, block] = larger
         buffer.orphan()
         buffer.write(data)
         return _Runs(buffer, columns["cell"], lines["cell"])
@@ -362,7 +367,7 @@ def _render(gaussians: Gaussians, view: View, quality: str) -> np.ndarray:
     sides = (blocks.side_for(view),)  # the only view of these tiles
     held: list[GlTile] = []
     try:
-        for part in split_tiles(visible(gaussians, view, quality)):
+        for part in split_tiles(visible(gaussians, view, quality), most=rasterizer.most):
             held.append(rasterizer.upload(part, quality, sides))
             if sum(tile.nbytes for tile in held) > HELD:
                 _add(rasterizer, held, view, image)
@@ -395,10 +400,7 @@ def _piece(view: View, x: int, y: int, width: int, height: int) -> View:
 
 def _draw(rasterizer: GlRasterizer, tiles: list[GlTile], view: View) -> np.ndarray:
     height, width = view.size
-    try:
-        target = rasterizer.ctx.texture((width, height), 4, dtype="f4")
-    except moderngl.Error as failure:
-        raise BackendError("The GPU is out of memory; use --backend cpu.") from failure
+    target = with_room(rasterizer.ctx, rasterizer.ctx.texture, (width, height), 4, dtype="f4")
     try:
         rasterizer.draw(tiles, view, target)
         return np.frombuffer(target.read(), np.float32).reshape(height, width, 4)[..., :3]

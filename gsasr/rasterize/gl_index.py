@@ -119,7 +119,7 @@ class GlIndex:
         where pack would make larger cells than asked for, or raise an error.
 
         The one read-back, of `found`, tells how large the tile's buffers have to be: the bounds
-        that are known before are more than twice that. Raises BackendError if the GPU has no room.
+        that are known before are more than twice that. Raises BackendError as allocate does.
         """
         from .footprint import TOLERANCE
 
@@ -129,7 +129,6 @@ class GlIndex:
         if self._tables is None:
             (self._tables,) = allocate(self.ctx, [4 * self._table_size])
         table = _table(gaussians)
-        raw, places = allocate(self.ctx, [table, 4 * len(table)])
         levels = [CELL_SIDES.index(side) for side in sides]
         most = max(cells.FEW, cells.ENTRIES_PER_GAUSSIAN * len(table))
         uniforms = {
@@ -138,8 +137,9 @@ class GlIndex:
             "finest": levels[0],
             "most_boxes": most // 2,  # 4 times as many cells: boxes are larger than ellipses
         }
-        work = _Work(len(table), raw, places, uniforms)
+        raw, places = allocate(self.ctx, [table, 4 * len(table)])
         try:
+            work = _Work(len(table), raw, places, uniforms)
             self._count(work, levels)
             found = _Found(np.frombuffer(self._tables.read(4 * len(SLOTS)), np.uint32))
             if not found.suits(levels[0], len(table), most):
@@ -283,8 +283,9 @@ class PrefixSum:
         if depth == len(self._sums):
             self._sums += allocate(self.ctx, [4 * blocks])
         elif self._sums[depth].size < 4 * blocks:
+            (larger,) = allocate(self.ctx, [4 * blocks])
             self._sums[depth].release()
-            (self._sums[depth],) = allocate(self.ctx, [4 * blocks])
+            self._sums[depth] = larger
         sums = self._sums[depth]
         sum_blocks, carry = self._programs
         self._run(sum_blocks, values, start, count, sums)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import BackendError
 from ..view import View
+from .opengl import storage_limit, with_room
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class GlLevel:
     wide: bool
     ordinary: int  # entries in ordinary lists, and in steep ones
     steep: int
-    longest: int
+    longest: int  # pairs in the longest list
 
 
 @dataclass(frozen=True)
@@ -66,16 +67,29 @@ class GlTile:
 
 
 def allocate(ctx: moderngl.Context, contents: Iterable[np.ndarray | int]) -> list[moderngl.Buffer]:
-    """A buffer of each array, or of so many bytes. Raises BackendError if there is no room."""
-    buffers = []
-    for content in contents:
-        size = content if isinstance(content, int) else content.nbytes
-        if size and not isinstance(content, int):
-            buffers.append(ctx.buffer(content))
-        else:
-            buffers.append(ctx.buffer(reserve=max(size, 32)))  # a buffer cannot be empty
-    if ctx.error == "GL_OUT_OF_MEMORY":
+    """A buffer of each: an array is uploaded, of a number so many bytes are only reserved.
+
+    Raises BackendError, and leaves nothing behind, if there is no room for all of them, or if one
+    is larger than shaders can read with this driver.
+    """
+    buffers: list[moderngl.Buffer] = []
+    try:
+        for content in contents:
+            buffers.append(_buffer(ctx, content))
+    except BaseException:
         for buffer in buffers:
             buffer.release()
-        raise BackendError("The GPU is out of memory; close other programs or use --backend cpu.")
+        raise
     return buffers
+
+
+def _buffer(ctx: moderngl.Context, content: np.ndarray | int) -> moderngl.Buffer:
+    size, limit = content if isinstance(content, int) else content.nbytes, storage_limit(ctx)
+    if size > limit:
+        raise BackendError(
+            f"The GPU takes {limit / 2**20:.0f} MiB in a buffer, and these Gaussians need "
+            f"{size / 2**20:.0f} MiB; make smaller tiles of them or use --backend cpu."
+        )
+    if isinstance(content, int) or size == 0:
+        return with_room(ctx, ctx.buffer, reserve=max(size, 32))  # a buffer cannot be empty
+    return with_room(ctx, ctx.buffer, content)

@@ -13,6 +13,8 @@ from ..errors import BackendError
 from ..files import shipped
 
 T = TypeVar("T")
+FULL = "The GPU is out of memory; close other programs or use --backend cpu."
+LEAST_STORAGE = 1 << 24  # bytes that any OpenGL 4.3 takes in a storage buffer
 SOFTWARE = ("llvmpipe", "softpipe", "swrast", "software rasterizer", "swiftshader")
 
 
@@ -58,6 +60,39 @@ def ask(question: Callable[[moderngl.Context], T]) -> T:
 def driver_info() -> dict:
     """What a headless context says of itself, by OpenGL's names. Raises BackendError if none."""
     return ask(lambda ctx: dict(ctx.info))
+
+
+def storage_limit(ctx: moderngl.Context) -> int:
+    """Bytes of the largest buffer that shaders can read."""
+    # An answer of 2^31 or more would come as a negative number.
+    return max(LEAST_STORAGE, ctx.info["GL_MAX_SHADER_STORAGE_BLOCK_SIZE"])
+
+
+def with_room(ctx: moderngl.Context, work: Callable[..., T], *arguments, **named) -> T:
+    """What `work(*arguments, **named)` makes or fills in video memory: a buffer, a texture.
+
+    Raises BackendError if there is no room for it.
+    """
+    _errors(ctx)  # of earlier commands: those are not this one's
+    try:
+        made = work(*arguments, **named)
+    except moderngl.Error as failure:
+        raise BackendError(FULL) from failure
+    if "GL_OUT_OF_MEMORY" in _errors(ctx):
+        if made is not None:
+            made.release()
+        raise BackendError(FULL)
+    return made
+
+
+def _errors(ctx: moderngl.Context) -> set[str]:
+    """All that the driver has noted since it was last asked."""
+    noted: set[str] = set()
+    while len(noted) < 8 and (error := ctx.error) != "GL_NO_ERROR":
+        if error in noted:  # a context that is lost may repeat itself for ever
+            break
+        noted.add(error)
+    return noted
 
 
 def software(info: dict) -> bool:

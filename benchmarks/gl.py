@@ -133,6 +133,7 @@ class Report:
 def contestants(
     ctx: moderngl.Context, drawn: Gaussians, names: list[str]
 ) -> Iterator[list[Contestant]]:
+    """Rasterizers by their names in CONTESTANTS, ready to draw the field; freed at the end."""
     made = [CONTESTANTS[name](ctx, drawn) for name in names]
     for each in made:
         each.draw(View((0.0, 0.0), (1.0, 1.0), (8, 8)))  # compiles what the first frame needs
@@ -143,7 +144,10 @@ def contestants(
 
 
 def statistics(report: Report, drawn: Gaussians, made: list[Contestant]) -> None:
-    """What the field is like, and what holding it costs."""
+    """Write what the field is like, and what each rasterizer takes to hold and to index it.
+
+    The first must be ours: its index tells how many Gaussians a cell sees.
+    """
     shares = torch.tensor([0.05, 0.5, 0.95])
     some = drawn.std.flatten()[:: max(1, 2 * len(drawn) // 1_000_000)]  # quantile's limit
     low, middle, high = some.quantile(shares).tolist()

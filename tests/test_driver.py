@@ -15,7 +15,9 @@ KIB_OF_2_GIB = 2 << 20
 class FakeDriver:
     """A context whose glGetIntegerv and glGetGraphicsResetStatus are ours."""
 
-    def __init__(self, extensions=(), answers=None, renderer="A card", status=0, there=True):
+    def __init__(
+        self, extensions=(), answers=None, renderer="A card", status=0, there=True, version=460
+    ):
         def ask(name, where):
             ctypes.cast(where, ctypes.POINTER(ctypes.c_int))[0] = (answers or {}).get(name, 0)
 
@@ -25,10 +27,13 @@ class FakeDriver:
         }
         self.extensions = set(extensions)
         self.info = {"GL_RENDERER": renderer}
+        self.version_code = version
+        self.asked_for = []  # names of functions
         loader = SimpleNamespace(load=self.address) if there else SimpleNamespace()
         self.mglo = SimpleNamespace(_context=loader)
 
     def address(self, name: str) -> int:
+        self.asked_for.append(name)
         return ctypes.cast(self.functions[name], ctypes.c_void_p).value
 
 
@@ -67,6 +72,18 @@ def test_a_reset_is_told_from_none():
     assert driver.lost(FakeDriver(status=0x8253))
     assert not driver.lost(FakeDriver())
     assert not driver.lost(FakeDriver(status=0x8253, there=False))
+
+
+def test_a_driver_that_promises_no_answer_is_not_asked():
+    assert not driver.lost(FakeDriver(status=0x8253, version=440))
+    assert driver.lost(FakeDriver(["GL_KHR_robustness"], status=0x8253, version=440))
+
+
+def test_the_function_that_tells_of_resets_is_looked_up_once():
+    ctx = FakeDriver()
+    for _ in range(3):
+        driver.lost(ctx)
+    assert len(ctx.asked_for) == 1
 
 
 def test_a_real_context_answers(gl_context):

@@ -1,6 +1,8 @@
 """The index that shaders build: its lists against the CPU's, its pictures against the oracle's."""
 
 import math
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -38,6 +40,7 @@ def build(rasterizer):
 def draw(rasterizer, made, view):
     target = rasterizer.ctx.texture(view.size[::-1], 4, dtype="f4")
     rasterizer.draw(made, view, target)
+    assert rasterizer.ctx.error == "GL_NO_ERROR"
     image = np.frombuffer(target.read(), np.float32).reshape(*view.size, 4)[..., :3]
     target.release()
     return image
@@ -353,6 +356,48 @@ def test_what_does_not_suit_the_shaders_is_left_to_the_cpu(rasterizer, build, fi
     expected = reference.render(field, view).numpy()
     assert np.abs(draw(rasterizer, [tile], view) - expected).max() < 1e-4 * max(1, expected.max())
     tile.release()
+
+
+def test_what_is_left_to_the_cpu_is_packed_on_another_thread(rasterizer, monkeypatch):
+    threads, go_on = [], threading.Event()
+
+    def pack(*arguments):
+        threads.append(threading.current_thread())
+        go_on.wait(10)
+        return tiles.pack(*arguments)
+
+    monkeypatch.setattr(gl, "pack", pack)
+    steps = rasterizer.uploading(EXTREMES["huge"], "export")
+    for _ in range(3):
+        start = time.perf_counter()
+        next(steps)
+        assert time.perf_counter() - start < 1
+    abandoned = rasterizer.uploading(EXTREMES["huge"], "export")
+    next(abandoned)
+    abandoned.close()  # waits for nothing
+    go_on.set()
+    with pytest.raises(StopIteration) as end:
+        while True:
+            next(steps)
+    end.value.value.release()
+    assert threading.main_thread() not in threads
+
+
+def test_each_step_of_warming_up_compiles_at_most_one_program(gl_context, monkeypatch):
+    rasterizer = gl.GlRasterizer(gl_context, index=True)
+    compiled = []
+    compute_shader = type(gl_context).compute_shader
+    monkeypatch.setattr(
+        type(gl_context), "compute_shader", lambda *a: compiled.append(a) or compute_shader(*a)
+    )
+    for number, _ in enumerate(rasterizer.warming(), start=1):
+        assert len(compiled) == number
+    assert number > len(gl_index.PROGRAMS)
+    field = random_field(5000, (30, 30))
+    field.std[:] += 0.05  # which short records can hold
+    rasterizer.upload(field, "screen").release()
+    assert len(compiled) == number  # none was forgotten
+    rasterizer.release()
 
 
 def test_values_that_are_not_finite_are_refused_as_on_the_cpu(rasterizer):

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import ctypes
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import moderngl
 
@@ -20,6 +22,9 @@ UNKNOWN = 1 << 30  # bytes of tiles to hold where the driver does not tell
 LEAST = 1 << 28
 SHARE = 0.7  # of what is free on a card; other programs, and our textures, need some
 SOFTWARE_SHARE = 0.2  # of free main memory, where that is what the renderer uses
+
+# How each context is asked whether it was reset, if it can be asked; every frame does
+_reset_status: WeakKeyDictionary[moderngl.Context, Callable[[], int] | None] = WeakKeyDictionary()
 
 _SIGNATURE = ctypes.WINFUNCTYPE if sys.platform == "win32" else ctypes.CFUNCTYPE
 
@@ -52,7 +57,13 @@ def lost(ctx: moderngl.Context) -> bool:
 
     Only a context made with notification of resets can tell; any other says False.
     """
-    status = _function(ctx, "glGetGraphicsResetStatus", ctypes.c_uint)
+    if ctx not in _reset_status:
+        # Without these a loader may have an address all the same, of a function that does nothing.
+        can_tell = ctx.version_code >= 450 or "GL_KHR_robustness" in ctx.extensions
+        _reset_status[ctx] = (
+            _function(ctx, "glGetGraphicsResetStatus", ctypes.c_uint) if can_tell else None
+        )
+    status = _reset_status[ctx]
     return status is not None and status() != 0
 
 

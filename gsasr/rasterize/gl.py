@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Generator, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -35,6 +35,7 @@ BLOCK = 4096  # widest piece that `render` draws at once, pixels
 PIXELS = 1 << 22  # most pixels in such a piece: 64 MiB
 PORTION = 1 << 15  # most pairs of a list that are read at once: llvmpipe ends loops at 2^16
 STEP = 1 << 22  # bytes of a tile that are uploaded at once
+PAUSE = 1e-3  # seconds of a step that waits for a tile to be packed
 HELD = 1 << 29  # bytes of tiles that `render` holds on the GPU at once, about
 
 
@@ -94,7 +95,7 @@ class GlRasterizer:
             pass
 
     def warming(self, dtype: str = "f2") -> Iterator[None]:
-        """The same, one program of `draw` per step, and those of the index in the last."""
+        """The same, one program per step."""
         usual = [_Variant(TARGETS[dtype], block) for block in self.shape.blocks]
         for variant in (*usual, _Variant(TARGETS[dtype], self.shape.steep, steep=True)):
             # No power of two: llvmpipe compiles anew for sides that are none.
@@ -107,8 +108,7 @@ class GlRasterizer:
             target.release()
             yield
         if self._index is not None:
-            self._index.warm_up()
-            yield
+            yield from self._index.warming()
 
     @property
     def packs(self) -> bool:
@@ -151,7 +151,7 @@ class GlRasterizer:
             made = self._index.build(tile, quality, sides) if self._index else None
             if made is not None:
                 return made
-            tile = pack(tile, quality, sides)
+            tile = yield from _packing(tile, quality, sides)
         arrays = [tile.records.data, *(a for c in tile.levels for a in (c.lists, c.entries))]
         buffers = allocate(self.ctx, [array.nbytes for array in arrays])
         try:
@@ -330,6 +330,19 @@ def _passes(level: GlLevel, block: int, view: View, shape: Shape) -> Iterator[_P
         yield _Pass(block, False, (0, 1), level.longest)
     if level.steep:
         yield _Pass(shape.steep, True, (1, 3), level.longest)
+
+
+def _packing(
+    gaussians: Gaussians, quality: str, sides: tuple[float, ...]
+) -> Generator[None, None, PackedTile]:
+    """What `pack` makes, on a thread meanwhile, as it takes longer than a frame."""
+    thread = ThreadPoolExecutor(1, thread_name_prefix="gl-pack")
+    packed = thread.submit(pack, gaussians, quality, sides)
+    thread.shutdown(wait=False)  # once it is done, whether or not the steps are gone through
+    while not packed.done():
+        wait([packed], PAUSE)  # to go through the steps without a break costs no core
+        yield
+    return packed.result()
 
 
 def _load(levels: list[GlLevel]) -> Load:

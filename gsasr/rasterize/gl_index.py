@@ -7,6 +7,7 @@ as those of cells.py, or a few more that miss a cell by less than SLACK, in no f
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -104,11 +105,12 @@ class GlIndex:
             end += -(-size // ALIGNMENT) * ALIGNMENT
         self._table_size = end
 
-    def warm_up(self) -> None:
-        """Compile all that `build` needs for the screen, lest a first tile wait for it."""
+    def warming(self) -> Iterator[None]:
+        """Compile what `build` needs for the screen, lest a first tile wait; a program per step."""
         for name in PROGRAMS:
             self._program(name, packed=name == "records")
-        self._scan.warm_up()
+            yield
+        yield from self._scan.warming()
 
     def build(
         self, gaussians: Gaussians, quality: str, sides: tuple[float, ...] = CELL_SIDES
@@ -229,7 +231,10 @@ class GlIndex:
         packed: bool = False,
         **uniforms: object,
     ) -> None:
-        """One shader over so many threads."""
+        """One shader over so many threads.
+
+        What it writes of the tile itself (records, lists, entries) must have been bound to 6.
+        """
         program = self._program(name, packed)
         work.raw.bind_to_storage_buffer(0)
         work.places.bind_to_storage_buffer(2)
@@ -265,20 +270,17 @@ class PrefixSum:
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self.ctx = ctx
-        self._programs: list[moderngl.ComputeShader] = []
+        self._programs: dict[bool, moderngl.ComputeShader] = {}
         self._sums: list[moderngl.Buffer] = []  # of blocks, of blocks of these, and so on
 
-    def warm_up(self) -> None:
-        """Compile what `run` needs."""
-        if not self._programs:
-            for defines in ({}, {"CARRY": 1}):
-                sizes = {"THREADS": THREADS, "BLOCK": self.BLOCK}
-                source = load_shader(self.ctx, "prefix_sum.comp", sizes | defines)
-                self._programs.append(self.ctx.compute_shader(source))
+    def warming(self) -> Iterator[None]:
+        """Compile what `run` needs, one program per step."""
+        for carry in (False, True):
+            self._program(carry)
+            yield
 
     def run(self, values: moderngl.Buffer, start: int, count: int, depth: int = 0) -> None:
         """Of `count` values from number `start` on, which must be a multiple of ALIGNMENT."""
-        self.warm_up()
         blocks = -(-count // self.BLOCK)
         if depth == len(self._sums):
             self._sums += allocate(self.ctx, [4 * blocks])
@@ -287,18 +289,25 @@ class PrefixSum:
             self._sums[depth].release()
             self._sums[depth] = larger
         sums = self._sums[depth]
-        sum_blocks, carry = self._programs
-        self._run(sum_blocks, values, start, count, sums)
+        self._run(self._program(carry=False), values, start, count, sums)
         if blocks > 1:
             self.run(sums, 0, blocks, depth + 1)
-            self._run(carry, values, start, count, sums)
+            self._run(self._program(carry=True), values, start, count, sums)
 
     def release(self) -> None:
         """Free the programs and buffers."""
-        for held in (*self._programs, *self._sums):
+        for held in (*self._programs.values(), *self._sums):
             held.release()
         self._programs.clear()
         self._sums.clear()
+
+    def _program(self, carry: bool) -> moderngl.ComputeShader:
+        """That sums up blocks, or that carries the sums of blocks into these."""
+        if carry not in self._programs:
+            defines = {"THREADS": THREADS, "BLOCK": self.BLOCK, **({"CARRY": 1} if carry else {})}
+            source = load_shader(self.ctx, "prefix_sum.comp", defines)
+            self._programs[carry] = self.ctx.compute_shader(source)
+        return self._programs[carry]
 
     def _run(self, program, values, start: int, count: int, sums) -> None:
         values.bind_to_storage_buffer(0, 4 * start, 4 * count)

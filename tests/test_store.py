@@ -243,6 +243,7 @@ class FakeScene:
     """A GPU with room for so many tiles."""
 
     packs = True
+    most = 1000
 
     def __init__(self, room: int) -> None:
         self.room = room

@@ -82,8 +82,11 @@ class App:
             self.lost = True  # there is nothing left to draw with, not even a message
             hello_imgui.get_runner_params().app_shall_exit = True
             return
-        if deliver(session.worker, session.scene, session.painter):
-            hello_imgui.request_refresh()
+        try:
+            if deliver(session.worker, session.scene, session.painter):
+                hello_imgui.request_refresh()
+        except BackendError as error:  # the picture stays as coarse as it is
+            session.fail(str(error))
         spent = time.perf_counter() - start
         menu.handle_keys(session)
         menu.draw(session)

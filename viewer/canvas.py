@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from imgui_bundle import imgui
 
+from gsasr.errors import BackendError
+
 from .session import Session
 
 WHEEL_ZOOM = 0.25  # octaves per notch
@@ -41,10 +43,16 @@ def draw(session: Session, bottom: float, spent: float) -> None:
     imgui.invisible_button("picture", size)
     _mouse(session, corner, density.x)
     session.camera.tick(io.delta_time)
-    if session.painter.paint(session.camera.view(), session.overlay(), spent):
-        session.state.frame_seconds = session.painter.seconds
-        session.state.color = None
-    _read_color(session)
+    try:
+        if session.painter.paint(session.camera.view(), session.overlay(), spent):
+            session.state.frame_seconds = session.painter.seconds
+            session.state.color = None
+        _read_color(session)
+    except BackendError:
+        session.painter.reset()
+        session.streaming.shrink()
+        imgui.end()
+        return
     session.scene.ctx.screen.use()  # what Dear ImGui draws into next
     draw_list = imgui.get_window_draw_list()
     for layer in session.painter.layers():

@@ -7,6 +7,7 @@ import math
 import moderngl
 import numpy as np
 
+from gsasr.rasterize.opengl import with_room
 from gsasr.view import View
 
 from .state import Rectangle
@@ -23,7 +24,9 @@ class Coverage:
         """size: (height, width) of the picture, source pixels."""
         rows, columns = (-(-side // BLOCK) for side in size)
         self.span = (columns * BLOCK, rows * BLOCK)  # source pixels, (x, y)
-        self.texture = ctx.texture((columns, rows), 1, bytes(rows * columns), alignment=1)
+        self.texture = with_room(
+            ctx, ctx.texture, (columns, rows), 1, bytes(rows * columns), alignment=1
+        )
         self.texture.repeat_x = self.texture.repeat_y = False
         # Beyond the picture there is nothing to wait for.
         self._around = np.pad(np.zeros((rows, columns), bool), EDGE, constant_values=True)

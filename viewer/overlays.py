@@ -9,7 +9,7 @@ import moderngl
 import numpy as np
 
 from gsasr.errors import RequestError
-from gsasr.rasterize.gl_tile import GlTile
+from gsasr.rasterize.gl_tile import GlTile, allocate
 from gsasr.rasterize.opengl import load_shader
 from gsasr.rasterize.records import FOLD
 from gsasr.view import View
@@ -101,7 +101,7 @@ class Overlays:
 
     def _reserve(self, count: int) -> None:
         """Room for the marks of a tile of `count` Gaussians."""
-        self._marks = self.ctx.buffer(reserve=count * MARK_BYTES)
+        (self._marks,) = allocate(self.ctx, [count * MARK_BYTES])
         self._arrays = {
             kind: self.ctx.vertex_array(program, [(self._marks, "4f 4f/i", "place", "look")])
             for kind, program in self._programs.items()

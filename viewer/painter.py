@@ -223,9 +223,10 @@ class Painter:
             self._scene.mark(view, overlay)
 
     def _resized(self, target: Target | None, size: tuple[int, int]) -> Target:
+        made = Target(self._scene.ctx, size)  # first: if there is no room, the old one stays
         if target is not None:
             target.release()
-        return Target(self._scene.ctx, size)
+        return made
 
 
 def _reduced(view: View, reduction: int) -> View:

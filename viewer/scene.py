@@ -16,6 +16,7 @@ import moderngl
 import numpy as np
 
 from gsasr.files import shipped
+from gsasr.rasterize.opengl import with_room
 from gsasr.view import View
 
 from .coverage import Coverage
@@ -46,7 +47,7 @@ class Target:
     def __init__(self, ctx: moderngl.Context, size: tuple[int, int]) -> None:
         """size: (height, width), pixels."""
         self.size = size
-        self.texture = ctx.texture((size[1], size[0]), 4)
+        self.texture = with_room(ctx, ctx.texture, (size[1], size[0]), 4)
         self.texture.filter = (moderngl.NEAREST, moderngl.NEAREST)
         self.texture.repeat_x = self.texture.repeat_y = False
         self.framebuffer = ctx.framebuffer([self.texture])
@@ -109,8 +110,10 @@ class Scene:
         """
         if self._source is not None and self._source.loading:
             return self._source.load(seconds)
-        if self._warming is not None and next(self._warming, "done") == "done":
-            self._warming = None
+        if self._warming is not None:
+            steps, self._warming = self._warming, None  # one that fails is not asked again
+            if next(steps, "done") != "done":
+                self._warming = steps
         return False
 
     def prepare(self) -> None:
@@ -149,6 +152,11 @@ class Scene:
     def packs(self) -> bool:
         """Once prepared: should tiles come packed, since `add_tile` would do it on the CPU?"""
         return self._rasterizer.packs
+
+    @property
+    def most(self) -> int:
+        """Once prepared: Gaussians that fit into one tile here."""
+        return self._rasterizer.most
 
     def add_tile(self, tile: PackedTile | Gaussians) -> None:
         """Add Gaussians of a tile; none is drawn before `cover`. Raises BackendError: no memory."""
@@ -261,6 +269,7 @@ class Scene:
         if self._marks is None or self._marks.size != view.size:
             if self._marks is not None:
                 self._marks.release()
+                self._marks = None
             self._marks = Target(self.ctx, view.size)
         target = self._marks.framebuffer
         target.clear(0.0, 0.0, 0.0, 0.0)
@@ -338,7 +347,8 @@ class Scene:
         if self._field is None or self._field.size != (size[1], size[0]):
             if self._field is not None:
                 self._field.release()
-            self._field = self.ctx.texture((size[1], size[0]), 4, dtype="f2")
+                self._field = None
+            self._field = with_room(self.ctx, self.ctx.texture, (size[1], size[0]), 4, dtype="f2")
         return self._field
 
     def _array(self, *needs: bool) -> moderngl.VertexArray:

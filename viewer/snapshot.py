@@ -79,9 +79,10 @@ def _fill(scene: Scene, tiles: TileStore, view: View, memory: int) -> None:
     """
     from gsasr.rasterize.gl import pack, split_tiles
 
+    scene.prepare()
     visible, held = tiles.visible(view), 0
     for index in tqdm(visible, "Gaussians", disable=None, bar_format="{l_bar}{bar}"):
-        for piece in split_tiles(tiles.gaussians(index)):
+        for piece in split_tiles(tiles.gaussians(index), most=scene.most):
             scene.add_tile(pack(piece))
         held += scene.cover(tiles.cores[index])
         if held > memory:

@@ -85,6 +85,18 @@ class Streaming:
             self._scene.uncover(tiles.cores[index])
             self._repaint(tiles.cores[index])
 
+    def shrink(self) -> None:
+        """The GPU is full: hold less from now on, and say so."""
+        document = self._state.document
+        held = document.tiles.shown_bytes if document and document.tiles else 0
+        self._state.gpu_memory = int(ROOM * held)
+        most = f"more than {held / 2**20:.1f} MiB of" if held else "any"
+        self._fail(
+            f"The GPU has no room for {most} Gaussians; "
+            "what does not fit shows as the source picture."
+        )
+        self.make_room()
+
     def _next(self, tiles: TileStore) -> tuple[int, bool] | None:
         eager = self._stopped is None
         return tiles.next(self._camera.view(), self._state.gpu_memory, eager)
@@ -105,7 +117,7 @@ class Streaming:
                 if not held:
                     tiles.keep(index, gaussians, self._camera.view())
                 if shown:
-                    pieces = split_tiles(gaussians)
+                    pieces = split_tiles(gaussians, most=self._scene.most)
                     if self._scene.packs:
                         pieces = [pack(piece) for piece in pieces]
                     self._worker.carry_out(task, self._arrive(tiles, index, pieces))
@@ -131,13 +143,7 @@ class Streaming:
             tiles.show(index, self._scene.cover(core))
             self._repaint(core)
         except BackendError:
-            held = tiles.shown_bytes
-            self._state.gpu_memory = int(ROOM * held)
-            most = f"more than {held / 2**20:.1f} MiB of" if held else "any"
-            self._fail(
-                f"The GPU has no room for {most} Gaussians; "
-                "what does not fit shows as the source picture."
-            )
+            self.shrink()
         except GsasrError:  # malformed Gaussians; the worker tells, and ends the task
             self.stop()
             raise

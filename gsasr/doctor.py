@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -84,6 +85,22 @@ def _opengl() -> Iterator[Finding]:
     limits = (f"{name} {info[key]:,} {unit}" for key, (name, unit) in GL_LIMITS.items())
     yield Finding("OpenGL limits", "; ".join(limits))
     yield Finding("GPU memory", _memory(opengl.ask(driver.video_memory)))
+    yield _shaders()
+
+
+def _shaders() -> Finding:
+    """Compiled as the viewer needs them; drivers keep them on disk, so its next start has them."""
+    import moderngl
+
+    from .rasterize import gl, opengl
+
+    start = time.perf_counter()
+    try:
+        opengl.ask(lambda ctx: gl.GlRasterizer(ctx).warm_up())
+    except (BackendError, moderngl.Error) as error:
+        reason = str(error).strip().splitlines()[-1]
+        return Finding("OpenGL shaders", reason, "update the driver, or use --backend cpu")
+    return Finding("OpenGL shaders", f"compiled in {time.perf_counter() - start:.2f} s")
 
 
 def _memory(memory: VideoMemory) -> str:

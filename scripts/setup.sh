@@ -109,6 +109,8 @@ if ! $VENV/bin/python -m pip install --disable-pip-version-check --no-input \
     tail -n 15 $LOG >&2
     fail "pip could not install the packages; the lines above say why (whole log in $LOG)."
 fi
+say "looking at what this machine has, and compiling shaders"
+$VENV/bin/gsasr doctor >>$LOG 2>&1 || true # only a first look; the viewer compiles what is missing
 recipe >$STAMP.new
 mv $STAMP.new $STAMP
 rm -f $STARTED

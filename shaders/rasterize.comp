@@ -132,6 +132,7 @@ void main()
     ALL(CLEAR)
     int list = 3 * (cell.y * grid_columns + cell.x);
     uint start = lists[list + part[0]], end = lists[list + part[1]];
+    if (start == end) return;
     uint base = lists[list + 2];
     end = min(end, start + portion[1]);
     for (uint pair = start + portion[0]; pair < end; ++pair) {

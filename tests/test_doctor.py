@@ -1,5 +1,6 @@
 """`gsasr doctor` says what there is, and what to do about what is missing."""
 
+import moderngl
 import pytest
 
 from gsasr import doctor
@@ -26,6 +27,17 @@ def test_the_limits_of_opengl_are_asked_of_the_driver(gl_context):
     assert gl_context.info["GL_RENDERER"] in found["OpenGL"].value
     assert f"{gl_context.info['GL_MAX_TEXTURE_SIZE']:,} pixels" in found["OpenGL limits"].value
     assert "the viewer fills up to" in found["GPU memory"].value
+
+
+def test_shaders_that_a_driver_refuses_are_a_finding(gl_context, monkeypatch):
+    assert "compiled in" in findings()["OpenGL shaders"].value
+
+    def refuse(*_):
+        raise moderngl.Error("GLSL Compiler failed\n\n0:1(1): error: no")
+
+    monkeypatch.setattr("gsasr.rasterize.gl.GlRasterizer.warm_up", refuse)
+    found = findings()["OpenGL shaders"]
+    assert found.value == "0:1(1): error: no" and "driver" in found.advice
 
 
 def test_what_is_missing_comes_with_advice(monkeypatch):

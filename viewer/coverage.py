@@ -10,7 +10,7 @@ import numpy as np
 from gsasr.rasterize.opengl import with_room
 from gsasr.view import View
 
-from .state import Rectangle
+Rectangle = tuple[int, int, int, int]  # x0, y0, x1, y1 in source pixels
 
 BLOCK = 4  # source pixels per texel
 EDGE = 2  # blocks kept off tiles that have not arrived: further than their Gaussians reach

@@ -19,7 +19,8 @@ import numpy as np
 from gsasr.errors import FieldError, ImageError
 from gsasr.files import require_file
 
-from .state import Document, Rectangle
+from .coverage import Rectangle
+from .state import Document
 from .store import TileStore
 from .worker import Task
 

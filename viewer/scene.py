@@ -19,10 +19,9 @@ from gsasr.files import shipped
 from gsasr.rasterize.opengl import with_room
 from gsasr.view import View
 
-from .coverage import Coverage
+from .coverage import Coverage, Rectangle
 from .mipmaps import Mipmaps, mipmaps
 from .source import Source
-from .state import Rectangle
 
 if TYPE_CHECKING:
     from gsasr.gaussians import Gaussians

@@ -20,8 +20,6 @@ TOLD = 3.0  # the one told by default, as in gsasr.prediction, which would load 
 
 LEAST_MEMORY = 1 << 24  # bytes of Gaussians that the user can let the GPU hold
 
-Rectangle = tuple[int, int, int, int]  # x0, y0, x1, y1 in source pixels
-
 
 @dataclass
 class Document:

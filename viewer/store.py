@@ -14,8 +14,7 @@ import numpy as np
 
 from gsasr.view import View
 
-from .coverage import REACH
-from .state import Rectangle
+from .coverage import REACH, Rectangle
 
 if TYPE_CHECKING:
     from gsasr.coded import CodedGaussians

@@ -14,10 +14,10 @@ from gsasr.errors import BackendError, Cancelled, GsasrError
 from gsasr.view import View
 
 from .camera import Camera
-from .coverage import REACH
+from .coverage import REACH, Rectangle
 from .painter import Painter
 from .scene import Scene
-from .state import Document, Rectangle, State
+from .state import Document, State
 from .store import TileStore
 from .worker import Task, Worker
 
